@@ -1,0 +1,147 @@
+"""Poses in the plane."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxloc.poses import series
+from jaxloc.poses.group import Group, as_floats, matmul
+from jaxloc.poses.rotation import SO2
+
+
+class SE2(Group):
+    """A planar pose: x forward, y left, heading theta counter-clockwise (m, m, rad).
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> T_world_robot = jl.poses.SE2(1.0, 2.0, jnp.pi / 2)
+        >>> bool(jnp.allclose(T_world_robot.apply(jnp.array([[1.0, 0.0]])), jnp.array([[1.0, 3.0]])))
+        True
+    """
+
+    rotation: SO2
+    translation: Float[Array, "2"]
+
+    dof: ClassVar[int] = 3
+    labels: ClassVar[tuple[str, ...]] = ("x", "y", "rotation")
+
+    def __init__(self, x: Any, y: Any, theta: Any):
+        x, y, theta = as_floats(x, y, theta)
+        self.rotation = SO2.from_angle(theta)
+        self.translation = jnp.stack([x, y])
+
+    @staticmethod
+    def from_parts(rotation: SO2, translation: Float[Array, "2"]) -> "SE2":
+        """Pose of a rotation and a translation, without passing through an angle."""
+        pose = object.__new__(SE2)
+        object.__setattr__(pose, "rotation", rotation)
+        object.__setattr__(pose, "translation", translation)
+        return pose
+
+    @staticmethod
+    def from_matrix(matrix: Float[Array, "3 3"]) -> "SE2":
+        """Pose of a homogeneous matrix."""
+        return SE2.from_parts(SO2(matrix[0, 0], matrix[1, 0]), matrix[:2, 2])
+
+    @staticmethod
+    def identity(dtype: Any = float) -> "SE2":
+        """The pose of the origin."""
+        return SE2.from_parts(SO2.identity(dtype), jnp.zeros(2, dtype))
+
+    @staticmethod
+    def exp(xi: Float[Array, "3"]) -> "SE2":
+        """Pose reached by the constant twist (v_x, v_y, omega) in unit time."""
+        theta = xi[2]
+        s = theta * theta
+        a, b = series.sinc(s), theta * series.versine(s)
+        translation = jnp.stack([a * xi[0] - b * xi[1], b * xi[0] + a * xi[1]])
+        return SE2.from_parts(SO2.from_angle(theta), translation)
+
+    @staticmethod
+    def left_jacobian(xi: Float[Array, "3"]) -> Float[Array, "3 3"]:
+        """``J`` with ``exp(xi + d) ~ exp(J d) @ exp(xi)``; the right one is ``left_jacobian(-xi)`` (Sola et al. 2018)."""
+        theta = xi[2]
+        s = theta * theta
+        a, b, c = series.sinc(s), series.versine(s), theta * series.third(s)
+        zero, one = jnp.zeros_like(theta), jnp.ones_like(theta)
+        rows = (
+            (a, -theta * b, c * xi[0] + b * xi[1]),
+            (theta * b, a, c * xi[1] - b * xi[0]),
+            (zero, zero, one),
+        )
+        return jnp.stack([jnp.stack(row) for row in rows])
+
+    @staticmethod
+    def left_jacobian_inverse(xi: Float[Array, "3"]) -> Float[Array, "3 3"]:
+        """Inverse of `left_jacobian`, for angles below 2 pi."""
+        jacobian = SE2.left_jacobian(xi)
+        inverse = _inverse_mean_rotation(xi[2])
+        column = -matmul(inverse, jacobian[:2, 2:])
+        return jnp.concatenate([jnp.concatenate([inverse, column], axis=1), jacobian[2:]])
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes of a stack."""
+        return self.translation.shape[:-1]
+
+    @property
+    def x(self) -> Float[Array, ""]:
+        """Position forward, m."""
+        return self.translation[0]
+
+    @property
+    def y(self) -> Float[Array, ""]:
+        """Position left, m."""
+        return self.translation[1]
+
+    @property
+    def theta(self) -> Float[Array, ""]:
+        """Heading in (-pi, pi], rad."""
+        return self.rotation.angle()
+
+    def log(self) -> Float[Array, "3"]:
+        """The twist that reaches this pose in unit time."""
+        theta = self.theta
+        linear = matmul(_inverse_mean_rotation(theta), self.translation)
+        return jnp.concatenate([linear, theta[None]])
+
+    def compose(self, other: "SE2") -> "SE2":
+        """``T_a_b @ T_b_c = T_a_c``."""
+        rotated = matmul(self.rotation.matrix(), other.translation)
+        return SE2.from_parts(self.rotation.compose(other.rotation), self.translation + rotated)
+
+    def retract(self, delta: Float[Array, "3"]) -> "SE2":
+        """``T @ exp(delta)``."""
+        return self.compose(SE2.exp(delta))
+
+    def inverse(self) -> "SE2":
+        """The map back."""
+        rotation = self.rotation.inverse()
+        return SE2.from_parts(rotation, -matmul(rotation.matrix(), self.translation))
+
+    def matrix(self) -> Float[Array, "3 3"]:
+        """Homogeneous matrix."""
+        top = jnp.concatenate([self.rotation.matrix(), self.translation[:, None]], axis=1)
+        return jnp.concatenate([top, jnp.array([[0, 0, 1]], top.dtype)])
+
+    def adjoint(self) -> Float[Array, "3 3"]:
+        """The matrix with ``T @ exp(d) == exp(adjoint @ d) @ T``."""
+        column = jnp.stack([self.y, -self.x])[:, None]
+        top = jnp.concatenate([self.rotation.matrix(), column], axis=1)
+        return jnp.concatenate([top, jnp.array([[0, 0, 1]], top.dtype)])
+
+    def apply(self, points: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
+        """Points of the inner frame in the outer frame."""
+        return self.rotation.apply(points) + self.translation[None, :]
+
+    def normalize(self) -> "SE2":
+        """The pose with its rotation made exact again."""
+        return SE2.from_parts(self.rotation.normalize(), self.translation)
+
+
+def _inverse_mean_rotation(theta: Float[Array, ""]) -> Float[Array, "2 2"]:
+    """Inverse of the mean of the rotations from 0 to theta, which turns a twist's velocity into a translation."""
+    diagonal = 1.0 - theta * theta * series.cotangent(theta * theta)
+    half = 0.5 * theta
+    return jnp.stack([jnp.stack([diagonal, half]), jnp.stack([-half, diagonal])])

@@ -1,0 +1,50 @@
+"""How the suite runs: strict dtypes and ranks, warnings are errors, compiled programs kept between runs."""
+
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+RECORDINGS = REPOSITORY.parent / "shared" / "data"
+_CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".jax_cache"))
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_compilation_cache_dir", _CACHE)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def pytest_collection_modifyitems(items):
+    """Recordings are no part of the project (their licences forbid it): tests that read them run where they lie."""
+    for item in items:
+        if item.get_closest_marker("recordings") and not RECORDINGS.is_dir():
+            item.add_marker(pytest.mark.skip(reason=f"the recordings are not at {RECORDINGS}"))
+
+
+@pytest.fixture
+def recordings() -> Path:
+    """The folder with the real recordings."""
+    return RECORDINGS
+
+
+@pytest.fixture
+def x64():
+    """Runs a test in float64."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request):
+    """Runs a test in both precisions: the dtype that its arrays should have."""
+    with jax.enable_x64(request.param == "float64"):
+        yield np.dtype(request.param)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Seeded random numbers for test data."""
+    return np.random.default_rng(0)
