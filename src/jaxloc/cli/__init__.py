@@ -1,0 +1,66 @@
+"""The command line: arguments in, pipelines run, reports out.
+
+Bad input ends with one line on stderr, ``jaxloc: error: <file>: <what>``, and exit code 2; an interrupt with 130.
+"""
+
+import os
+import sys
+
+__all__ = ["main", "run"]
+
+_BAD_INPUT, _INTERRUPTED = 2, 130
+
+
+def main() -> None:
+    """Runs the command line and leaves the process with its exit code."""
+    code = run(sys.argv[1:])
+    sys.stdout.flush()
+    sys.exit(code)
+
+
+def run(arguments: list[str]) -> int:
+    """Runs a command.
+
+    Args:
+        arguments: what follows ``jaxloc``.
+
+    Returns:
+        The exit code: 0, 2 after bad input, 130 after an interrupt.
+    """
+    try:
+        from jaxloc.cli.commands import app
+    except ImportError as error:
+        return _fail(f'the command line needs {error.name}: pip install "jaxloc[cli]"')
+    try:
+        return int(app(args=arguments or ["--help"], prog_name="jaxloc", standalone_mode=False) or 0)
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except BrokenPipeError:
+        # The reader of our output left, as `head` does: say nothing more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        if type(error).__name__ == "Abort":
+            return _INTERRUPTED
+        message = _describe(error)
+        if message is None:
+            raise
+        return _fail(message)
+
+
+def _describe(error: Exception) -> str | None:
+    """The line that explains bad input, or None when the error is ours."""
+    if hasattr(error, "format_message"):  # an argument that the command line parser refused
+        return error.format_message()
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, ImportError) and "pip install" in str(error):
+        return str(error)
+    from jaxloc.data import DataError
+
+    return str(error) if isinstance(error, DataError) else None
+
+
+def _fail(message: str) -> int:
+    print(f"jaxloc: error: {' '.join(message.split())}", file=sys.stderr)
+    return _BAD_INPUT

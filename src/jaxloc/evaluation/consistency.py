@@ -1,0 +1,157 @@
+"""Whether an estimator knows how wrong it is: errors measured in its own sigmas, against the chi-square distribution.
+
+References:
+    Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, section 5.4.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxloc.beliefs import chi2_quantile
+from jaxloc.poses import Trajectory
+
+
+class SquaredErrors(eqx.Module):
+    """Squared errors in units of the covariance.
+
+    Args:
+        values: chi-square distributed where the estimator is consistent; zero where not ok.
+        ok: whether the covariance was positive definite and everything finite.
+    """
+
+    values: Float[Array, "*s"]
+    ok: Bool[Array, "*s"]
+
+
+class Interval(eqx.Module):
+    """An interval.
+
+    Args:
+        lower: its lower end.
+        upper: its upper end.
+    """
+
+    lower: Float[Array, "*s"]
+    upper: Float[Array, "*s"]
+
+
+@eqx.filter_jit
+def nees(error: Float[Array, " d"], covariance: Float[Array, "d d"]) -> SquaredErrors:
+    """Normalized estimation error squared: ``e^T P^-1 e``.
+
+    Args:
+        error: tangent from the estimate to the truth.
+        covariance: of the estimate, in the same tangent space.
+
+    Returns:
+        One value, chi-square distributed with d degrees of freedom when the estimator is consistent.
+
+    References:
+        Bar-Shalom et al. 2001, eq. 5.4.2-7. [T-56]
+
+    Example:
+        >>> float(nees(jnp.array([1.0, 2.0]), jnp.diag(jnp.array([1.0, 4.0]))).values)
+        2.0
+    """
+    finite = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(covariance))
+    eye = jnp.eye(error.shape[0], dtype=error.dtype)
+    root = jnp.linalg.cholesky(jax.lax.stop_gradient(jnp.where(finite, covariance, eye)))
+    ok = finite & jnp.all(jnp.isfinite(root))
+    safe = jnp.where(ok, covariance, eye)
+    whitened = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(safe), jnp.where(ok, error, 0.0), lower=True)
+    return SquaredErrors(jnp.sum(whitened**2), ok)
+
+
+@eqx.filter_jit
+def nis(innovation: Float[Array, " d"], covariance: Float[Array, "d d"]) -> SquaredErrors:
+    """Normalized innovation squared: ``v^T S^-1 v``, which needs no truth.
+
+    Args:
+        innovation: measurement minus its prediction.
+        covariance: of the innovation.
+
+    Returns:
+        One value, chi-square distributed with d degrees of freedom when the filter is consistent.
+
+    References:
+        Bar-Shalom et al. 2001, eq. 5.4.2-9. [T-56]
+
+    Example:
+        >>> float(nis(jnp.array([2.0]), jnp.array([[4.0]])).values)
+        1.0
+    """
+    return nees(innovation, covariance)
+
+
+@eqx.filter_jit
+def trajectory_nees(estimate: Trajectory, covariances: Float[Array, "n d d"], truth: Trajectory) -> SquaredErrors:
+    """:func:`nees` of every pose of a path, in the right tangent space of the estimate.
+
+    Args:
+        estimate: the estimated path.
+        covariances: of the poses ``T exp(d)``, translation first.
+        truth: the true path, pose by pose.
+
+    Returns:
+        A value for each pose; not ok where the covariance is singular, as it is at a start that is known.
+
+    Example:
+        >>> import jaxloc as jl
+        >>> path = jl.data.simulate_points.simulate_drive(3, key=jax.random.key(0))
+        >>> trajectory_nees(path, jnp.tile(jnp.eye(6), (3, 1, 1)), path).ok.tolist()
+        [True, True, True]
+    """
+    errors = jax.vmap(lambda a, b: a.local(b))(estimate.poses, truth.poses)
+    return jax.vmap(nees)(errors, covariances)
+
+
+@eqx.filter_jit
+def mean_bounds(degrees_of_freedom: int, num_values: int, *, confidence: float | Float[Array, ""] = 0.95) -> Interval:
+    """Where the mean of independent NEES or NIS values lies when the estimator is consistent.
+
+    Args:
+        degrees_of_freedom: of one value.
+        num_values: how many are averaged.
+        confidence: probability of the interval; both tails are equally likely.
+
+    Returns:
+        The interval.
+
+    References:
+        Bar-Shalom et al. 2001, eq. 5.4.2-13.
+
+    Example:
+        >>> bounds = mean_bounds(4, 50)
+        >>> round(float(bounds.lower), 2), round(float(bounds.upper), 2)
+        (3.25, 4.82)
+    """
+    tail = 0.5 * (1.0 - jnp.asarray(confidence, dtype=float))
+    dof = float(degrees_of_freedom * num_values)
+    return Interval(chi2_quantile(tail, dof) / num_values, chi2_quantile(1.0 - tail, dof) / num_values)
+
+
+@eqx.filter_jit
+def coverage(
+    squared: SquaredErrors, degrees_of_freedom: int, *, probabilities: tuple[float, ...] = (0.5, 0.9, 0.95)
+) -> Float[Array, " k"]:
+    """The fraction of truths that lie in the estimator's own confidence ellipsoids.
+
+    Args:
+        squared: NEES values.
+        degrees_of_freedom: of one value.
+        probabilities: of the ellipsoids.
+
+    Returns:
+        Fractions, equal to the probabilities when the estimator is consistent; zero where no value is ok.
+
+    Example:
+        >>> values = SquaredErrors(jnp.array([0.1, 2.0, 30.0]), jnp.ones(3, bool))
+        >>> coverage(values, 2, probabilities=(0.5, 0.9)).tolist() == [jnp.float32(1 / 3), jnp.float32(2 / 3)]
+        True
+    """
+    values, ok = squared.values.ravel(), squared.ok.ravel()
+    limits = chi2_quantile(jnp.array(probabilities, values.dtype), degrees_of_freedom)
+    inside = (values[None] <= limits[:, None]) & ok[None]
+    return jnp.sum(inside, axis=1).astype(values.dtype) / jnp.maximum(jnp.sum(ok), 1).astype(values.dtype)
