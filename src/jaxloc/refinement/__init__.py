@@ -1,0 +1,16 @@
+"""Features to pose: residuals of what a camera sees, and the poses that explain it best."""
+
+from jaxloc.refinement import reprojection, resection
+from jaxloc.refinement.reprojection import Reprojection, StereoReprojection
+from jaxloc.refinement.resection import StereoMatches, motion_problem, refine_motion, refine_pose
+
+__all__ = [
+    "Reprojection",
+    "StereoMatches",
+    "StereoReprojection",
+    "motion_problem",
+    "refine_motion",
+    "refine_pose",
+    "reprojection",
+    "resection",
+]

@@ -1,0 +1,223 @@
+"""Reprojection residuals: where a camera should see known points, against where it sees them.
+
+Points lie along the last axis here, components along the first: that is how the inner loops run fast.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxloc.poses import SE3
+from jaxloc.poses.group import matmul
+from jaxloc.sensors import Pinhole, StereoRig
+from jaxloc.solvers import Linearization, Problem, Quadratic
+
+# Residual, in sigmas, of a point that the camera cannot see: dear, so that no step hides points behind the camera.
+_UNSEEN = 1e3
+
+
+class Reprojection(Problem):
+    """Pixels of known points in one camera; the state is its pose ``T_world_camera``.
+
+    Attributes:
+        camera: the camera.
+        points: "3 n", world frame, m; finite everywhere.
+        pixels: "2 n" (u, v), px; finite everywhere.
+        sigma: standard deviation of a pixel coordinate, px.
+        valid: items that count.
+        loss: robust kernel over the two components of an item.
+    """
+
+    camera: Pinhole
+    points: Float[Array, "3 n"]
+    pixels: Float[Array, "2 n"]
+    sigma: Float[Array, ""]
+    valid: Bool[Array, " n"]
+    loss: Any = Quadratic()
+
+    def residual(self, state: SE3) -> Float[Array, "2 n"]:
+        """Whitened pixel errors, zero for masked items [K-56]."""
+        c, seen = _camera_points(self.camera, state, self.points, self.valid)
+        predicted = jnp.stack(self.camera.project_components(*c))
+        return _mask(predicted - self.pixels, seen, self.valid, 1.0 / self.sigma)
+
+    def linearize(self, state: SE3) -> Linearization:
+        """Residual and its Jacobian in closed form."""
+        c, seen = _camera_points(self.camera, state, self.points, self.valid)
+        predicted = jnp.stack(self.camera.project_components(*c))
+        jacobian = _pose_jacobian(_pixel_jacobian(self.camera, c), c)
+        scale = jnp.where(seen, 1.0 / self.sigma, 0.0)
+        residual = _mask(predicted - self.pixels, seen, self.valid, 1.0 / self.sigma)
+        return Linearization(residual, jacobian * scale[None, None, :])
+
+    def hessian(self, state: SE3) -> Float[Array, "6 6"]:
+        """Exact Hessian at a minimum."""
+        c, seen = _camera_points(self.camera, state, self.points, self.valid)
+
+        def item_cost(*c: Array) -> Array:
+            error = (jnp.stack(self.camera.project_components(*c)) - self.pixels) / self.sigma
+            return jnp.where(seen, self.loss.rho(jnp.sum(error**2, axis=0)), 0.0)
+
+        return _rigid_hessian(item_cost, c)
+
+
+class StereoReprojection(Problem):
+    """Stereo measurements of points known with error; the state is the pose ``T_world_camera`` of the left camera.
+
+    Attributes:
+        rig: the stereo rig.
+        points: "3 n", world frame, m; finite everywhere.
+        measured: "3 n" (u_left, u_right, v), px; finite everywhere.
+        whitener: "3 3 n", lower triangular ``W`` with ``W S W^T = I`` for the covariance S of an item's residual.
+        valid: items that count.
+        loss: robust kernel over the three components of an item.
+    """
+
+    rig: StereoRig
+    points: Float[Array, "3 n"]
+    measured: Float[Array, "3 n"]
+    whitener: Float[Array, "3 3 n"]
+    valid: Bool[Array, " n"]
+    loss: Any = Quadratic()
+
+    def residual(self, state: SE3) -> Float[Array, "3 n"]:
+        """Whitened measurement errors, zero for masked items."""
+        c, seen = _camera_points(self.rig.camera, state, self.points, self.valid)
+        return self._whitened_error(c, seen)
+
+    def _whitened_error(self, c: tuple[Array, Array, Array], seen: Bool[Array, " n"]) -> Float[Array, "3 n"]:
+        error = self.rig.project_components(*c) - self.measured
+        return _mask(_lower_product(self.whitener, error), seen, self.valid, 1.0)
+
+    def linearize(self, state: SE3) -> Linearization:
+        """Residual and its Jacobian in closed form."""
+        c, seen = _camera_points(self.rig.camera, state, self.points, self.valid)
+        jacobian = _pose_jacobian(stereo_jacobian(self.rig, c), c)
+        jacobian = jax.vmap(lambda column: _lower_product(self.whitener, column))(jacobian)
+        return Linearization(self._whitened_error(c, seen), jnp.where(seen[None, None, :], jacobian, 0.0))
+
+    def hessian(self, state: SE3) -> Float[Array, "6 6"]:
+        """Exact Hessian at a minimum."""
+        c, seen = _camera_points(self.rig.camera, state, self.points, self.valid)
+
+        def item_cost(*c: Array) -> Array:
+            error = _lower_product(self.whitener, self.rig.project_components(*c) - self.measured)
+            return jnp.where(seen, self.loss.rho(jnp.sum(error**2, axis=0)), 0.0)
+
+        return _rigid_hessian(item_cost, c)
+
+
+def _camera_points(
+    camera: Pinhole, pose: SE3, points: Float[Array, "3 n"], valid: Bool[Array, " n"]
+) -> tuple[Any, Any]:
+    """Component arrays of the points in the camera frame, safe where they cannot be seen, and where they can."""
+    rotation = pose.rotation.matrix()
+    moved = matmul(rotation.T, points - pose.translation[:, None])
+    seen = valid & camera.in_front_components(moved[0], moved[1], moved[2])
+    x, y, z = jnp.where(seen, moved[0], 0.0), jnp.where(seen, moved[1], 0.0), jnp.where(seen, moved[2], 1.0)
+    return (x, y, z), seen
+
+
+def _mask(
+    error: Float[Array, "k n"], seen: Bool[Array, " n"], valid: Bool[Array, " n"], scale: Any
+) -> Float[Array, "k n"]:
+    unseen = jnp.where(valid & ~seen, _UNSEEN, 0.0).astype(error.dtype)
+    return jnp.where(seen[None, :], error * scale, unseen[None, :])
+
+
+def _pixel_jacobian(camera: Pinhole, c: tuple[Array, Array, Array]) -> Float[Array, "3 2 n"]:
+    """Derivative of the pixel with respect to the point: direction first, then pixel component."""
+    x, y, z = c
+    inverse = 1.0 / z
+    xn, yn = x * inverse, y * inverse
+    one, zero = jnp.ones_like(xn), jnp.zeros_like(xn)
+    if camera.lens is None:
+        xx, yx, xy, yy = one, zero, zero, one
+    else:
+        _, (xx, yx) = jax.jvp(camera.lens.distort, (xn, yn), (one, zero))
+        _, (xy, yy) = jax.jvp(camera.lens.distort, (xn, yn), (zero, one))
+    ux, uy = camera.fx * xx + camera.skew * yx, camera.fx * xy + camera.skew * yy
+    vx, vy = camera.fy * yx, camera.fy * yy
+    along = (
+        jnp.stack([ux, vx]) * inverse[None],
+        jnp.stack([uy, vy]) * inverse[None],
+        -jnp.stack([ux * xn + uy * yn, vx * xn + vy * yn]) * inverse[None],
+    )
+    return jnp.stack(along)
+
+
+def stereo_jacobian(rig: StereoRig, c: tuple[Array, Array, Array]) -> Float[Array, "3 3 n"]:
+    """Derivative of (u_left, u_right, v) with respect to the point: direction first, then component."""
+    pixel = _pixel_jacobian(rig.camera, c)
+    inverse = 1.0 / c[2]
+    zero = jnp.zeros_like(inverse)
+    approach = jnp.stack([zero, zero, rig.camera.fx * rig.baseline * inverse * inverse])
+    return jnp.stack([pixel[:, 0], pixel[:, 0] + approach, pixel[:, 1]], axis=1)
+
+
+def _pose_jacobian(point_jacobian: Float[Array, "3 k n"], c: tuple[Array, Array, Array]) -> Float[Array, "6 k n"]:
+    """Chain rule to the pose's tangent: a right perturbation (v, w) moves the point by ``-v + c x w``."""
+    jx, jy, jz = point_jacobian[0], point_jacobian[1], point_jacobian[2]
+    x, y, z = (component[None] for component in c)
+    return jnp.stack([-jx, -jy, -jz, jy * z - jz * y, jz * x - jx * z, jx * y - jy * x])
+
+
+def _rigid_hessian(item_cost: Any, c: tuple[Array, Array, Array]) -> Float[Array, "6 6"]:
+    """Hessian, along the tangent of a pose, of a sum of costs of points in the frame of the camera, at a minimum.
+
+    The chain rule to second order: the curvature A of a cost in its point gives ``D^T A D`` with the derivative D of
+    the point, and its slope g meets the second derivative of ``exp(-d) c``, whose part ``g . (w x (w x c)) / 2`` is
+    left over where the slopes add up to zero.
+    """
+    one, zero = jnp.ones_like(c[0]), jnp.zeros_like(c[0])
+
+    def slope(*c: Array) -> tuple[Array, ...]:
+        return jax.vjp(item_cost, *c)[1](one)
+
+    axes = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
+    curvature = jnp.stack([jnp.stack(jax.jvp(slope, c, axis)[1]) for axis in axes])
+    eye = jnp.stack([jnp.stack(axis) for axis in axes])
+    moves = _pose_jacobian(eye, c)
+    bent = _pose_jacobian(curvature, c)
+    size = moves.shape[0]
+    product = matmul(moves.reshape(size, -1), bent.reshape(size, -1).T)
+    lever = matmul(jnp.stack(slope(*c)), jnp.stack(c).T)
+    turning = 0.5 * (lever + lever.T) - jnp.trace(lever) * jnp.eye(3, dtype=lever.dtype)
+    return product.at[3:, 3:].add(turning)
+
+
+def _lower_product(lower: Float[Array, "3 3 n"], vector: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    return jnp.stack(
+        [
+            lower[0, 0] * vector[0],
+            lower[1, 0] * vector[0] + lower[1, 1] * vector[1],
+            lower[2, 0] * vector[0] + lower[2, 1] * vector[1] + lower[2, 2] * vector[2],
+        ]
+    )
+
+
+@eqx.filter_jit
+def whitener(covariances: Float[Array, "n 3 3"]) -> Float[Array, "3 3 n"]:
+    """Inverse Cholesky factors of many 3x3 covariances, unrolled, points along the last axis.
+
+    Args:
+        covariances: positive definite.
+
+    Returns:
+        Lower triangular ``W`` with ``W S W^T = I``.
+    """
+    s = jnp.moveaxis(covariances, 0, -1)
+    tiny = jnp.finfo(s.dtype).tiny
+    root = lambda pivot: 1.0 / jnp.sqrt(jnp.maximum(pivot, tiny))  # noqa: E731
+    a = root(s[0, 0])
+    l10, l20 = s[1, 0] * a, s[2, 0] * a
+    b = root(s[1, 1] - l10 * l10)
+    l21 = (s[2, 1] - l20 * l10) * b
+    c = root(s[2, 2] - l20 * l20 - l21 * l21)
+    zero = jnp.zeros_like(a)
+    w10 = -l10 * a * b
+    rows = ((a, zero, zero), (w10, b, zero), (-(l20 * a + l21 * w10) * c, -l21 * b * c, c))
+    return jnp.stack([jnp.stack(row) for row in rows])

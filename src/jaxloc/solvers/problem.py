@@ -1,0 +1,215 @@
+"""What is to be solved: a whitened residual with its data, and its normal equations."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxloc.poses import retract, tangent_dimension
+from jaxloc.poses.group import matmul
+from jaxloc.solvers.robust import Loss, Quadratic
+
+
+class Linearization(NamedTuple):
+    """A residual and how it moves with the tangent of the state.
+
+    Attributes:
+        residual: whitened, a pytree of arrays whose last axis runs over items (points, lines, ...).
+        jacobian: the same pytree, each array with a leading axis over the tangent's d directions.
+    """
+
+    residual: Any
+    jacobian: Any
+
+
+class Problem(eqx.Module):
+    """A whitened residual with its data: a pytree, so that new numbers never compile anew.
+
+    A residual is an array, or a pytree of arrays, in sigmas. The last axis runs over items, the axes before it over the
+    components of one item; the loss acts on the squared norm of an item. ``loss`` is one kernel, or a pytree of kernels
+    that is a prefix of the residual's.
+
+    Subclasses give ``residual`` and ``loss``, and may give ``linearize`` where the Jacobian is short in closed form.
+    """
+
+    loss: eqx.AbstractVar[Any]
+
+    @abstractmethod
+    def residual(self, state: Any) -> Any:
+        """Whitened residual at a state (any pytree with poses and arrays)."""
+
+    def linearize(self, state: Any) -> Linearization:
+        """Residual and Jacobian in the tangent space of the state; by forward differentiation unless overridden."""
+        zero = jnp.zeros(tangent_dimension(state), float_dtype(state))
+        residual, push = jax.linearize(lambda delta: self.residual(retract(state, delta)), zero)
+        return Linearization(residual, jax.vmap(push)(jnp.eye(zero.size, dtype=zero.dtype)))
+
+    def hessian(self, state: Any) -> Float[Array, "d d"]:
+        """Exact Hessian of the cost along the tangent at a minimum, kernels included: what derivatives of it need.
+
+        By forward over reverse differentiation, one direction after the other, unless overridden.
+        """
+        zero = jnp.zeros(tangent_dimension(state), float_dtype(state))
+        slope = jax.grad(lambda delta: cost_along(self, state, delta))
+        return jax.lax.map(lambda e: jax.jvp(slope, (zero,), (e,))[1], jnp.eye(zero.size, dtype=zero.dtype))
+
+
+class FunctionProblem(Problem):
+    """A problem of a plain function ``residual(state, data)``.
+
+    The function is static: define it once at module level (a fresh lambda for every call would be compiled every time),
+    and let everything that changes travel in ``data``.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> def line(state, data):
+        ...     return state["slope"] * data["x"] - data["y"]
+        >>> data = {"x": jnp.array([1.0, 2.0]), "y": jnp.array([2.0, 4.0])}
+        >>> float(jl.solvers.solve(jl.solvers.FunctionProblem(line, data), {"slope": jnp.array(0.0)}).value["slope"])
+        2.0
+    """
+
+    function: Callable[[Any, Any], Any] = eqx.field(static=True)
+    data: Any
+    loss: Any = Quadratic()
+
+    def residual(self, state: Any) -> Any:
+        """The function at the state and the data."""
+        return self.function(state, self.data)
+
+
+class NormalEquations(NamedTuple):
+    """Second-order picture of the cost about a state.
+
+    Attributes:
+        cost: sum of rho.
+        gradient: of the cost along the tangent.
+        hessian: of the cost, in the Gauss-Newton form with IRLS weights: an upper bound, safe far from the minimum.
+        bend: what the falling weights of robust kernels take off the Hessian, no more than leaves it positive; None for
+            plain least squares. With it, steps near the minimum converge as fast as Newton's.
+    """
+
+    cost: Float[Array, ""]
+    gradient: Float[Array, " d"]
+    hessian: Float[Array, "d d"]
+    bend: Float[Array, "d d"] | None
+
+
+def float_dtype(state: Any) -> Any:
+    """The floating dtype of a state."""
+    return jnp.result_type(*[leaf for leaf in jax.tree.leaves(state) if eqx.is_inexact_array(leaf)])
+
+
+def _is_loss(node: Any) -> bool:
+    return isinstance(node, Loss)
+
+
+def with_losses(loss: Any, *trees: Any) -> list[tuple]:
+    """The kernel beside each array of the residual (and of trees with the same structure)."""
+    pairs: list[tuple] = []
+
+    def collect(kernel: Loss, *parts: Any) -> None:
+        columns = [jax.tree.leaves(part) for part in parts]
+        pairs.extend((kernel, *row) for row in zip(*columns, strict=True))
+
+    jax.tree.map(collect, loss, *trees, is_leaf=_is_loss)
+    return pairs
+
+
+def items(residual: Array) -> Float[Array, "k n"]:
+    """A residual array as components by items."""
+    return residual.reshape(-1, residual.shape[-1] if residual.ndim else 1)
+
+
+def cost(problem: Problem, state: Any) -> Float[Array, ""]:
+    """The exact objective: the sum of rho over items."""
+    parts = [
+        jnp.sum(kernel.rho(jnp.sum(items(r) ** 2, axis=0)))
+        for kernel, r in with_losses(problem.loss, problem.residual(state))
+    ]
+    return _total(parts)
+
+
+def cost_along(problem: Problem, state: Any, delta: Float[Array, " d"]) -> Float[Array, ""]:
+    """The exact objective along the tangent at a state."""
+    return cost(problem, retract(state, delta))
+
+
+def normal_equations(problem: Problem, state: Any) -> NormalEquations:
+    """Cost, gradient and IRLS Gauss-Newton Hessian: one matrix product of the stacked Jacobian and residual."""
+    linear = problem.linearize(state)
+    parts = [
+        _normal_part(kernel, items(r), j.reshape(j.shape[0], -1, items(r).shape[1]))
+        for kernel, r, j in with_losses(problem.loss, linear.residual, linear.jacobian)
+    ]
+    if not parts:
+        raise ValueError("The residual holds no array: there is nothing to solve.")
+    costs, gradients, hessians, bends = zip(*parts, strict=True)
+    bends = [bend for bend in bends if bend is not None]
+    return NormalEquations(_total(costs), _total(gradients), _total(hessians), _total(bends) if bends else None)
+
+
+def _total(parts: Any) -> Array:
+    return sum(parts[1:], start=parts[0])
+
+
+def _normal_part(kernel: Loss, r: Float[Array, "k n"], j: Float[Array, "d k n"]) -> NormalEquations:
+    stacked = jnp.concatenate([j, r[None]])
+    size = stacked.shape[0]
+    if isinstance(kernel, Quadratic):
+        flat = stacked.reshape(size, -1)
+        product = matmul(flat, flat.T)
+        return NormalEquations(0.5 * product[-1, -1], product[:-1, -1], product[:-1, :-1], None)
+    squared = jnp.sum(r**2, axis=0)
+    weight, slope = _weight_and_slope(kernel, squared)
+    product = matmul((stacked * weight[None, None, :]).reshape(size, -1), stacked.reshape(size, -1).T)
+    score = jnp.sum(j * r[None], axis=1)
+    # At least a tenth of the weight is left along the residual.
+    least = -0.9 * weight / jnp.where(squared > 0, squared, 1.0)
+    fall = jnp.where(squared > 0, jnp.maximum(2.0 * slope, least), 0.0)
+    bend = matmul(score * fall[None, :], score.T)
+    return NormalEquations(jnp.sum(kernel.rho(squared)), product[:-1, -1], product[:-1, :-1], bend)
+
+
+def _weight_and_slope(kernel: Loss, squared: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """IRLS weight and its derivative in the squared norm."""
+    return jax.jvp(kernel.weight, (squared,), (jnp.ones_like(squared),))
+
+
+def sandwich(problem: Problem, state: Any) -> tuple[Float[Array, "d d"], Float[Array, "d d"]]:
+    """Bread and meat of the covariance ``A^-1 B A^-1`` of an M-estimate.
+
+    Items under a quadratic loss obey the noise model: their ``B`` equals their ``A = J^T J``. Items under a robust
+    kernel need not, so ``A`` is the curvature of rho and ``B`` the spread of the scores that were seen.
+
+    References:
+        Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 1967.
+    """
+    linear = problem.linearize(state)
+    bread, meat = [], []
+    for kernel, residual, jacobian in with_losses(problem.loss, linear.residual, linear.jacobian):
+        r = items(residual)
+        j = jacobian.reshape(jacobian.shape[0], -1, r.shape[1])
+        flat = j.reshape(j.shape[0], -1)
+        if isinstance(kernel, Quadratic):
+            product = matmul(flat, flat.T)
+            bread.append(product)
+            meat.append(product)
+            continue
+        squared = jnp.sum(r**2, axis=0)
+        weight, slope = _weight_and_slope(kernel, squared)
+        score = jnp.sum(j * r[None], axis=1)
+        weighted = (j * weight[None, None, :]).reshape(j.shape[0], -1)
+        bread.append(matmul(weighted, flat.T) + 2.0 * matmul(score * slope[None, :], score.T))
+        scaled = score * weight[None, :]
+        meat.append(matmul(scaled, scaled.T))
+    return _total(bread), _total(meat)
+
+
+def is_quadratic(loss: Any) -> bool:
+    """Whether every kernel is plain least squares."""
+    return all(isinstance(kernel, Quadratic) for kernel in jax.tree.leaves(loss, is_leaf=_is_loss))
