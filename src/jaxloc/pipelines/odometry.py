@@ -24,6 +24,7 @@ from jaxloc.slam import (
     Motion,
     MotionOptions,
     StereoFeatures,
+    estimate_disparity_offset,
     estimate_motion,
     match_frames,
     match_stereo,
@@ -137,7 +138,7 @@ def steps(frames: Iterable[Any], rig: StereoRig, config: Config | None = None) -
 def calibrate_disparity(frames: Iterable[Any], rig: StereoRig, config: Config | None = None) -> Gaussian:
     """What to add to the disparities of a recording so that near and far points move alike.
 
-    Give it to `MatchingOptions.disparity_offset`. The motions of the frames vote with a weight for each vote's precision;
+    Give it to `MatchingOptions.disparity_offset`. The motions of the frames vote, weighted by each vote's precision;
     the variance is that of the votes' spread.
 
     Args:

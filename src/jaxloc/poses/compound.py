@@ -1,7 +1,8 @@
 """Jacobians of compound planar poses in their parameters (x, y, theta), as Kelly writes them.
 
-They differ from the tangents of the rest of jaxloc: a perturbation here adds to x, y and theta in the outer frame. Of the
-compound ``c = a @ b`` the left Jacobian is ``dc/da``, the right one ``dc/db``; the inverse Jacobian is that of ``a^-1``.
+They differ from the tangents of the rest of jaxloc: a perturbation here adds to x, y and theta in the outer frame. Of
+the compound ``c = a @ b`` the left Jacobian is ``dc/da``, the right one ``dc/db``; the inverse Jacobian is that of
+``a^-1``.
 
 References:
     Kelly, Mobile Robotics, 2013, section 2.7; used in his section 9.2 for mosaics and fiducials [K-4, K-85].

@@ -60,7 +60,7 @@ class SE2(Group):
 
     @staticmethod
     def left_jacobian(xi: Float[Array, "3"]) -> Float[Array, "3 3"]:
-        """``J`` with ``exp(xi + d) ~ exp(J d) @ exp(xi)``; the right one is ``left_jacobian(-xi)`` (Sola et al. 2018)."""
+        """``J`` with ``exp(xi + d) ~ exp(J d) @ exp(xi)``; the right one is ``left_jacobian(-xi)``."""
         theta = xi[2]
         s = theta * theta
         a, b, c = series.sinc(s), series.versine(s), theta * series.third(s)

@@ -12,6 +12,7 @@ from jaxloc.poses import SE3
 from jaxloc.refinement.reprojection import Reprojection, StereoReprojection, stereo_jacobian, whitener
 from jaxloc.sensors import Pinhole, StereoRig
 from jaxloc.solvers import Estimate, GaussNewton, Quadratic, Solver, solve
+from jaxloc.solvers.least_squares import trusted
 from jaxloc.solvers.problem import is_quadratic
 
 
@@ -86,8 +87,9 @@ def refine_motion(
         previous: "n 3" (u_left, u_right, v) in the previous frame, px.
         current: "n 3" the same points in the current frame, px.
         initial: guess of ``T_previous_current``, the pose of the current left camera in the previous one.
-        covariance_previous: of measurements in the previous frame, px^2, one for all or one a point; identity by
-        default. covariance_current: of measurements in the current frame, likewise.
+        covariance_previous: of measurements in the previous frame, px^2, one for all or one a point; identity
+            by default.
+        covariance_current: of measurements in the current frame, likewise.
         loss: robust kernel over an item's three components, in sigmas.
         valid: which matches count.
 
@@ -222,4 +224,4 @@ def _unless_behind(estimate: Estimate, problem: Any, camera: Pinhole) -> Estimat
         return estimate
     seen = camera.in_front(estimate.value.inverse().apply(problem.points.T))
     ok = estimate.ok & jnp.all(seen | ~problem.valid)
-    return eqx.tree_at(lambda e: e.ok, estimate, ok)
+    return eqx.tree_at(lambda e: e.ok, trusted(estimate, ok), ok)

@@ -19,7 +19,8 @@ class MatchingOptions(eqx.Module):
         max_disparity: greatest disparity, px.
         max_distance: greatest Hamming distance of ORB descriptors, bits.
         ratio: greatest ratio of the nearest to the second nearest distance.
-        window: how far a point may lie from where it is predicted, (right, down) px.
+        window: how far a point may lie from where it is predicted, along each axis, px.
+        max_matches: matches between frames that are refined and kept.
         sigma: standard deviation added to what the patches say: rectification, slanted surfaces, px.
         disparity_offset: added to measured disparities, px: what the calibration of the pair left over.
         patches: how patches are refined to subpixels.
@@ -30,6 +31,7 @@ class MatchingOptions(eqx.Module):
     max_distance: float = eqx.field(static=True, default=80.0)
     ratio: float = eqx.field(static=True, default=0.95)
     window: float = eqx.field(static=True, default=40.0)
+    max_matches: int = eqx.field(static=True, default=800)
     sigma: float = eqx.field(static=True, default=0.15)
     disparity_offset: float = eqx.field(static=True, default=0.0)
     patches: subpixel.PatchRefinement = subpixel.PatchRefinement()
@@ -111,26 +113,28 @@ def match_frames(
         options: what counts as a match.
 
     Returns:
-        Matches, one a reference feature, with covariances of both measurements.
+        At most ``options.max_matches`` matches, with covariances of both measurements.
     """
     expected = rig.project(prediction.inverse().apply(rig.triangulate(reference.measured)))
     gate = window_gate(expected[:, jnp.array([0, 2])], current.measured[:, jnp.array([0, 2])], radius=options.window)
     found = _match(reference.descriptors, current.descriptors, gate & reference.has_depth[:, None], options)
-    seen = current.measured[found.index]
-    uv_reference = reference.measured[:, jnp.array([0, 2])]
+    # Most slots are empty: only those with a match are refined.
+    kept = jnp.argsort(~found.valid, stable=True)[: options.max_matches]
+    partner, before = found.index[kept], reference.measured[kept]
+    seen, known, expected = current.measured[partner], current.has_depth[partner], expected[kept]
+    uv_reference = before[:, jnp.array([0, 2])]
     moved = subpixel.refine_translation(
         reference.left, current.left, uv_reference, seen[:, jnp.array([0, 2])], options=options.patches
     )
-    known = current.has_depth[found.index]
     disparity = jnp.where(known, seen[:, 0] - seen[:, 1], expected[:, 0] - expected[:, 1])
     guess = jnp.stack([moved.uv[:, 0] - disparity + options.disparity_offset, moved.uv[:, 1]], axis=1)
     beside = subpixel.refine_stereo(current.left, current.right, moved.uv, guess, options=options.patches)
     measured = jnp.stack([moved.uv[:, 0], beside.uv[:, 0] - options.disparity_offset, moved.uv[:, 1]], axis=1)
-    valid = reference.has_depth & found.valid & moved.ok & beside.ok & (measured[:, 0] - measured[:, 1] > 0.5)
+    valid = found.valid[kept] & moved.ok & beside.ok & (measured[:, 0] - measured[:, 1] > 0.5)
     return StereoMatches.of(
-        reference.measured,
+        before,
         measured,
-        _reference_covariance(reference.variance, options),
+        _reference_covariance(reference.variance[kept], options),
         _current_covariance(moved.covariance, beside.variance, options),
         valid,
     )

@@ -177,8 +177,7 @@ class TangentSolver(optx.AbstractLeastSquaresSolver):
         return _Picture(normal.cost, normal.gradient * scale, hessian, scale, residual, jacobian)
 
     def _normal_info(self, picture: _Picture) -> optx.FunctionInfo.EvalGradHessian:
-        """What optimistix sees; divided by the initial damping, so that its unit damping is that part of the
-        diagonal."""
+        """What optimistix sees; over the initial damping, so that its unit damping is that part of the diagonal."""
         inverse = 1.0 / self.strategy.damping
         hessian = lx.MatrixLinearOperator(picture.hessian * inverse, lx.positive_semidefinite_tag)
         return optx.FunctionInfo.EvalGradHessian(picture.cost * inverse, picture.gradient * inverse, hessian)

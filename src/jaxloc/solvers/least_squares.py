@@ -54,22 +54,37 @@ def solve(problem: Problem, initial: Any, *, solver: Solver = GaussNewton(), max
     """
     start, clean = _finite_start(initial)
     found, status, num_steps = minimize(problem, start, solver, max_steps)
-    # Everything about the answer comes from one linearization there; only the value's own derivative is implicit.
-    normal = normal_equations(problem, found)
-    factorized = factor(normal.hessian)
-    status = jnp.where((status <= Status.MAX_STEPS) & factorized.deficient, int(Status.RANK_DEFICIENT), status)
+    # Whether to believe it is settled without derivatives: those of a problem full of nan are then cut at its door.
+    normal = normal_equations(_detached(problem), found)
+    status = jnp.where(
+        (status <= Status.MAX_STEPS) & factor(normal.hessian).deficient, int(Status.RANK_DEFICIENT), status
+    )
     finite = jnp.isfinite(normal.cost) & jnp.all(jnp.isfinite(normal.hessian))
     status = jnp.where(clean & finite, status, int(Status.NONFINITE))
-    ok = jax.lax.stop_gradient(status == int(Status.CONVERGED))
+    ok = status == int(Status.CONVERGED)
+    problem = trusted(problem, ok)
     value = attach_gradient(found, problem, ok)
-    return Estimate(
-        value, covariance(problem, value, ok), _safe(normal.cost), ok, num_steps, status, _safe(normal.hessian)
-    )
+    normal = normal_equations(problem, value)
+    spread = covariance(problem, value, ok)
+    return Estimate(value, spread, _safe(normal.cost), ok, num_steps, status, _safe(normal.hessian))
+
+
+def trusted(tree: Any, ok: Bool[Array, ""]) -> Any:
+    """The tree itself, its derivatives cut (also those that are nan) where ``ok`` is False."""
+
+    def cut(leaf: Any) -> Any:
+        return jnp.where(ok, leaf, jax.lax.stop_gradient(leaf)) if eqx.is_inexact_array(leaf) else leaf
+
+    return jax.tree.map(cut, tree)
+
+
+def _detached(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
 
 
 def _finite_start(initial: Any) -> tuple[Any, Bool[Array, ""]]:
     """The start without gradient, with anything not finite replaced, and whether nothing had to be."""
-    start = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, initial)
+    start = _detached(initial)
     moving, rest = eqx.partition(start, eqx.is_inexact_array)
     checks = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(moving)]
     if not checks:
@@ -101,14 +116,13 @@ def _residual(moving: Any, args: Any) -> Any:
 
 def minimize(problem: Problem, start: Any, solver: Solver, max_steps: int) -> tuple[Any, Array, Array]:
     """The iterations: value, status and number of steps, without derivatives."""
-    detached = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, problem)
     moving, rest = eqx.partition(start, eqx.is_inexact_array)
     dtype = jnp.result_type(*jax.tree.leaves(moving))
     solution = optx.least_squares(
         _residual,
         TangentSolver(solver, dtype),
         moving,
-        (detached, rest),
+        (_detached(problem), rest),
         max_steps=max_steps,
         adjoint=_Detached(),
         throw=False,
@@ -127,6 +141,7 @@ def covariance(problem: Problem, value: Any, ok: Bool[Array, ""]) -> Float[Array
     Returns:
         ``(J^T J)^-1`` for plain least squares; ``A^-1 B A^-1`` under robust kernels.
     """
+    problem, value = trusted((problem, value), ok)
     if is_quadratic(problem.loss):
         result = factor(normal_equations(problem, value).hessian).inverse()
     else:
@@ -134,8 +149,7 @@ def covariance(problem: Problem, value: Any, ok: Bool[Array, ""]) -> Float[Array
         inverse = factor(bread).inverse()
         spread = matmul(inverse, matmul(meat, inverse))
         result = jnp.where(ok, spread, inverse)
-    result = _safe(result)
-    return jnp.where(ok, result, jax.lax.stop_gradient(result))
+    return trusted(_safe(result), ok)
 
 
 @eqx.filter_custom_jvp
@@ -175,7 +189,7 @@ def _attach_gradient_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
         return jax.grad(cost_along, argnums=2)(eqx.combine(perturbed, fixed), value, delta)
 
     _, change = jax.jvp(lambda perturbed: slope(zero, perturbed), (moving,), (problem_tangent,))
-    delta = -matmul(_inverse(problem.hessian(value), ok), change)
+    delta = jnp.where(ok, -matmul(_inverse(problem.hessian(value), ok), change), 0.0)
     arrays, rest = eqx.partition(value, eqx.is_inexact_array)
     _, tangent = jax.jvp(
         lambda d: eqx.filter(retract(eqx.combine(arrays, rest), d), eqx.is_inexact_array), (zero,), (delta,)

@@ -134,7 +134,7 @@ def sample_indices(key: Key[Array, ""], valid: Bool[Array, " n"], size: int, cou
     ranks: list[Int[Array, " count"]] = []
     for i in range(size):
         last = available - size + i
-        drawn = jnp.minimum((uniform[:, i] * (last + 1)).astype(last.dtype), last)
+        drawn = jnp.minimum((uniform[:, i] * (last + 1).astype(uniform.dtype)).astype(last.dtype), last)
         taken = [drawn == rank for rank in ranks]
         repeated = jnp.any(jnp.stack(taken), axis=0) if taken else jnp.zeros_like(drawn, bool)
         ranks.append(jnp.where(repeated, last, drawn))

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+REPOSITORY = Path(__file__).resolve().parent
 RECORDINGS = REPOSITORY.parent / "shared" / "data"
 _CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".jax_cache"))
 
