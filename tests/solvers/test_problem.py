@@ -87,9 +87,11 @@ def test_sandwich_of_a_mean(x64, rng):
     data = jnp.asarray(rng.normal(size=50))
     problem = FunctionProblem(lambda x, data: (x[0] - data)[None, :], data, Huber(1.0))
     bread, meat = sandwich(problem, jnp.zeros(1))
-    inside = np.abs(data) <= 1.0
+    squared, inside = np.asarray(data) ** 2, np.abs(data) <= 1.0
     np.testing.assert_allclose(bread, [[inside.sum()]], rtol=1e-12)
-    np.testing.assert_allclose(meat, [[np.sum(np.clip(data, -1.0, 1.0) ** 2)]], rtol=1e-12)
+    leverage = np.where(inside, 1.0, 1.0 / np.sqrt(squared)) / inside.sum()
+    expected = np.sum(np.minimum(squared, 1.0) / (1.0 - leverage) ** 2)
+    np.testing.assert_allclose(meat, [[expected]], rtol=1e-12)
     bread, meat = sandwich(FunctionProblem(problem.function, data), jnp.zeros(1))
     assert float(bread[0, 0]) == float(meat[0, 0]) == 50.0
 

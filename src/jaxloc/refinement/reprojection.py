@@ -14,6 +14,7 @@ from jaxloc.poses import SE3
 from jaxloc.poses.group import matmul
 from jaxloc.sensors import Pinhole, StereoRig
 from jaxloc.solvers import Linearization, Problem, Quadratic
+from jaxloc.solvers.problem import is_quadratic
 
 # Residual, in sigmas, of a point that the camera cannot see: dear, so that no step hides points behind the camera.
 _UNSEEN = 1e3
@@ -48,10 +49,14 @@ class Reprojection(Problem):
         """Residual and its Jacobian in closed form."""
         c, seen = _camera_points(self.camera, state, self.points, self.valid)
         predicted = jnp.stack(self.camera.project_components(*c))
-        jacobian = _pose_jacobian(_pixel_jacobian(self.camera, c), c)
-        scale = jnp.where(seen, 1.0 / self.sigma, 0.0)
-        residual = _mask(predicted - self.pixels, seen, self.valid, 1.0 / self.sigma)
-        return Linearization(residual, jacobian * scale[None, None, :])
+        # Weight and mask enter at the smallest arrays.
+        weight = jnp.where(seen, 1.0 / self.sigma, 0.0)
+        jacobian = _pose_jacobian(_pixel_jacobian(self.camera, c, weight), c)
+        return Linearization(_mask(predicted - self.pixels, seen, self.valid, 1.0 / self.sigma), jacobian)
+
+    def admissible(self, state: SE3) -> Bool[Array, ""]:
+        """Whether, under plain least squares, every point that counts is ahead of the camera."""
+        return _all_seen(self.camera, state, self.points, self.valid, self.loss)
 
     def hessian(self, state: SE3) -> Float[Array, "6 6"]:
         """Exact Hessian at a minimum."""
@@ -99,6 +104,10 @@ class StereoReprojection(Problem):
         jacobian = jax.vmap(lambda column: _lower_product(self.whitener, column))(jacobian)
         return Linearization(self._whitened_error(c, seen), jnp.where(seen[None, None, :], jacobian, 0.0))
 
+    def admissible(self, state: SE3) -> Bool[Array, ""]:
+        """Whether, under plain least squares, every point that counts is ahead of the camera."""
+        return _all_seen(self.rig.camera, state, self.points, self.valid, self.loss)
+
     def hessian(self, state: SE3) -> Float[Array, "6 6"]:
         """Exact Hessian at a minimum."""
         c, seen = _camera_points(self.rig.camera, state, self.points, self.valid)
@@ -121,6 +130,14 @@ def _camera_points(
     return (x, y, z), seen
 
 
+def _all_seen(camera: Pinhole, pose: SE3, points: Array, valid: Array, loss: Any) -> Bool[Array, ""]:
+    """Robust kernels take a point behind the camera for an outlier; otherwise the pose or the data are wrong."""
+    if not is_quadratic(loss):
+        return jnp.array(True)
+    _, seen = _camera_points(camera, pose, points, valid)
+    return jnp.all(seen == valid)
+
+
 def _mask(
     error: Float[Array, "k n"], seen: Bool[Array, " n"], valid: Bool[Array, " n"], scale: Any
 ) -> Float[Array, "k n"]:
@@ -128,8 +145,8 @@ def _mask(
     return jnp.where(seen[None, :], error * scale, unseen[None, :])
 
 
-def _pixel_jacobian(camera: Pinhole, c: tuple[Array, Array, Array]) -> Float[Array, "3 2 n"]:
-    """Derivative of the pixel with respect to the point: direction first, then pixel component."""
+def _pixel_jacobian(camera: Pinhole, c: tuple[Array, Array, Array], weight: Any = 1.0) -> Float[Array, "3 2 n"]:
+    """Derivative of the weighted pixel with respect to the point: direction first, then pixel component."""
     x, y, z = c
     inverse = 1.0 / z
     xn, yn = x * inverse, y * inverse
@@ -139,14 +156,11 @@ def _pixel_jacobian(camera: Pinhole, c: tuple[Array, Array, Array]) -> Float[Arr
     else:
         _, (xx, yx) = jax.jvp(camera.lens.distort, (xn, yn), (one, zero))
         _, (xy, yy) = jax.jvp(camera.lens.distort, (xn, yn), (zero, one))
-    ux, uy = camera.fx * xx + camera.skew * yx, camera.fx * xy + camera.skew * yy
-    vx, vy = camera.fy * yx, camera.fy * yy
-    along = (
-        jnp.stack([ux, vx]) * inverse[None],
-        jnp.stack([uy, vy]) * inverse[None],
-        -jnp.stack([ux * xn + uy * yn, vx * xn + vy * yn]) * inverse[None],
-    )
-    return jnp.stack(along)
+    scale = weight * inverse
+    ux, uy = (camera.fx * xx + camera.skew * yx) * scale, (camera.fx * xy + camera.skew * yy) * scale
+    vx, vy = camera.fy * yx * scale, camera.fy * yy * scale
+    rows = ((ux, vx), (uy, vy), (-(ux * xn + uy * yn), -(vx * xn + vy * yn)))
+    return jnp.stack([jnp.stack(row) for row in rows])
 
 
 def stereo_jacobian(rig: StereoRig, c: tuple[Array, Array, Array]) -> Float[Array, "3 3 n"]:

@@ -12,8 +12,6 @@ from jaxloc.poses import SE3
 from jaxloc.refinement.reprojection import Reprojection, StereoReprojection, stereo_jacobian, whitener
 from jaxloc.sensors import Pinhole, StereoRig
 from jaxloc.solvers import Estimate, GaussNewton, Quadratic, Solver, solve
-from jaxloc.solvers.least_squares import trusted
-from jaxloc.solvers.problem import is_quadratic
 
 
 @eqx.filter_jit
@@ -62,7 +60,7 @@ def refine_pose(
     usable, points, pixels = _usable(valid, points_world, pixels)
     sigma = jnp.asarray(sigma, pixels.dtype)
     problem = Reprojection(camera, points.T, pixels.T, sigma, usable, loss)
-    return _unless_behind(solve(problem, initial, solver=solver), problem, camera)
+    return solve(problem, initial, solver=solver)
 
 
 @eqx.filter_jit
@@ -114,7 +112,7 @@ def refine_motion(
     first = solve(motion_problem(rig, matches, initial, loss), initial, max_steps=10)
     weights_at = jax.tree.map(jax.lax.stop_gradient, first.value)
     problem = motion_problem(rig, matches, weights_at, loss)
-    return _unless_behind(solve(problem, weights_at), problem, rig.camera)
+    return solve(problem, weights_at)
 
 
 class StereoMatches(eqx.Module):
@@ -216,12 +214,3 @@ def _usable(valid: Any, first: Array, second: Array) -> tuple[Bool[Array, " n"],
     finite = jnp.all(jnp.isfinite(first), axis=1) & jnp.all(jnp.isfinite(second), axis=1)
     usable = finite if valid is None else valid & finite
     return usable, jnp.where(usable[:, None], first, 0.0), jnp.where(usable[:, None], second, 0.0)
-
-
-def _unless_behind(estimate: Estimate, problem: Any, camera: Pinhole) -> Estimate:
-    """Under plain least squares a counted point behind the camera means that the pose or the data are wrong."""
-    if not is_quadratic(problem.loss):
-        return estimate
-    seen = camera.in_front(estimate.value.inverse().apply(problem.points.T))
-    ok = estimate.ok & jnp.all(seen | ~problem.valid)
-    return eqx.tree_at(lambda e: e.ok, trusted(estimate, ok), ok)

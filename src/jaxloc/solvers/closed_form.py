@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from jaxloc.poses import SE2, SE3, SO2, SO3
 from jaxloc.poses.group import matmul
 from jaxloc.solvers.estimate import Estimate, Status
-from jaxloc.solvers.least_squares import attach_gradient, covariance
+from jaxloc.solvers.least_squares import attach_gradient, covariance, trusted
 from jaxloc.solvers.linear import rank_tolerance
 from jaxloc.solvers.problem import Problem, normal_equations
 from jaxloc.solvers.robust import Quadratic
@@ -211,8 +211,9 @@ def _horn(cross: Float[Array, "3 3"]) -> tuple[SO3, Float[Array, ""]]:
 
 
 def _estimate(problem: PointAlignment, found: Any, determined: Bool[Array, ""]) -> Estimate:
-    normal = normal_equations(problem, found)
+    problem = trusted(problem, determined)
     value = attach_gradient(found, problem, determined)
+    normal = normal_equations(problem, value)
     status = jnp.where(determined, int(Status.CONVERGED), int(Status.RANK_DEFICIENT)).astype(int)
-    spread = covariance(problem, value, determined)
+    spread = covariance(problem, value, normal, determined)
     return Estimate(value, spread, normal.cost, determined, jnp.zeros((), int), status, normal.hessian)

@@ -19,6 +19,7 @@ class Status(IntEnum):
     RANK_DEFICIENT = 2
     DIVERGED = 3
     NONFINITE = 4
+    INADMISSIBLE = 5
 
 
 _MEANING = {
@@ -27,6 +28,7 @@ _MEANING = {
     Status.RANK_DEFICIENT: "the data do not determine every direction of the state",
     Status.DIVERGED: "the cost ended above that of the start: start closer, or use LevenbergMarquardt()",
     Status.NONFINITE: "the data or the start hold nan or inf",
+    Status.INADMISSIBLE: "the answer contradicts the model, as a point behind the camera that sees it does",
 }
 
 

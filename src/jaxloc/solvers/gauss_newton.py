@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.poses import retract, tangent_dimension
 from jaxloc.solvers.estimate import Status
-from jaxloc.solvers.linear import Cholesky
+from jaxloc.solvers.linear import Cholesky, factor
 from jaxloc.solvers.problem import NormalEquations, Problem, items, normal_equations, with_losses
 
 
@@ -156,7 +156,7 @@ class TangentSolver(optx.AbstractLeastSquaresSolver):
         eps = float(jnp.finfo(dtype).eps)
         self.strategy = strategy
         # Steps below this part of the value, or of the cost, are rounding noise.
-        self.rtol = strategy.rtol if strategy.rtol is not None else 50.0 * eps
+        self.rtol = strategy.rtol if strategy.rtol is not None else 10.0 * eps
         self.atol = self.rtol
         self.norm = optx.max_norm
 
@@ -261,6 +261,13 @@ class TangentSolver(optx.AbstractLeastSquaresSolver):
         last = retract(y, jnp.where(done, state.picture.scale * state.step, 0.0))
         status = jnp.where(state.terminate, state.status, int(Status.MAX_STEPS))
         status = jnp.where(state.picture.cost > state.first_cost * 1.001, int(Status.DIVERGED), status)
+        deficient = factor(state.picture.hessian).deficient & (status <= int(Status.MAX_STEPS))
+        status = jnp.where(deficient, int(Status.RANK_DEFICIENT), status)
+        problem, rest = args
+        senseless = done & ~problem.admissible(eqx.combine(last, rest)) & ~deficient
+        status = jnp.where(senseless, int(Status.INADMISSIBLE), status)
+        finite = jnp.isfinite(state.picture.cost) & jnp.all(jnp.isfinite(state.picture.hessian))
+        status = jnp.where(finite, status, int(Status.NONFINITE))
         return last, aux, {"status": status.astype(int)}
 
 

@@ -14,7 +14,15 @@ from jaxloc.poses.group import matmul
 from jaxloc.solvers.estimate import Estimate, Status
 from jaxloc.solvers.gauss_newton import GaussNewton, Solver, TangentSolver
 from jaxloc.solvers.linear import factor
-from jaxloc.solvers.problem import Problem, cost_along, float_dtype, is_quadratic, normal_equations, sandwich
+from jaxloc.solvers.problem import (
+    NormalEquations,
+    Problem,
+    cost_along,
+    float_dtype,
+    is_quadratic,
+    normal_equations,
+    sandwich,
+)
 
 
 @eqx.filter_jit
@@ -54,18 +62,13 @@ def solve(problem: Problem, initial: Any, *, solver: Solver = GaussNewton(), max
     """
     start, clean = _finite_start(initial)
     found, status, num_steps = minimize(problem, start, solver, max_steps)
-    # Whether to believe it is settled without derivatives: those of a problem full of nan are then cut at its door.
-    normal = normal_equations(_detached(problem), found)
-    status = jnp.where(
-        (status <= Status.MAX_STEPS) & factor(normal.hessian).deficient, int(Status.RANK_DEFICIENT), status
-    )
-    finite = jnp.isfinite(normal.cost) & jnp.all(jnp.isfinite(normal.hessian))
-    status = jnp.where(clean & finite, status, int(Status.NONFINITE))
+    status = jnp.where(clean, status, int(Status.NONFINITE))
     ok = status == int(Status.CONVERGED)
+    # Derivatives of a problem full of nan are cut at its door.
     problem = trusted(problem, ok)
     value = attach_gradient(found, problem, ok)
     normal = normal_equations(problem, value)
-    spread = covariance(problem, value, ok)
+    spread = covariance(problem, value, normal, ok)
     return Estimate(value, spread, _safe(normal.cost), ok, num_steps, status, _safe(normal.hessian))
 
 
@@ -130,20 +133,20 @@ def minimize(problem: Problem, start: Any, solver: Solver, max_steps: int) -> tu
     return eqx.combine(solution.value, rest), solution.stats["status"], solution.stats["num_steps"]
 
 
-def covariance(problem: Problem, value: Any, ok: Bool[Array, ""]) -> Float[Array, "d d"]:
+def covariance(problem: Problem, value: Any, normal: NormalEquations, ok: Bool[Array, ""]) -> Float[Array, "d d"]:
     """Covariance of a minimum in its tangent space, finite also where directions are undetermined.
 
     Args:
         problem: the problem, in sigmas of its noise model.
         value: the minimum.
+        normal: the normal equations there.
         ok: where False, derivatives are cut.
 
     Returns:
         ``(J^T J)^-1`` for plain least squares; ``A^-1 B A^-1`` under robust kernels.
     """
-    problem, value = trusted((problem, value), ok)
     if is_quadratic(problem.loss):
-        result = factor(normal_equations(problem, value).hessian).inverse()
+        result = factor(normal.hessian).inverse()
     else:
         bread, meat = sandwich(problem, value)
         inverse = factor(bread).inverse()

@@ -5,11 +5,9 @@ solves, so that the step does not move along that direction, and by the smallest
 covariance there is huge but finite.
 """
 
-from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import lineax as lx
 from jax.scipy.linalg import solve_triangular
@@ -52,12 +50,11 @@ class Factor(eqx.Module):
     def inverse(self) -> Float[Array, "d d"]:
         """Inverse of H; along undetermined pivots the variance is finite, but huge."""
         size = self.scale.shape[0]
-        eye = jnp.eye(size, dtype=self.scale.dtype)
         if size <= UNROLLED:
-            rows = jax.vmap(partial(_forward, self.lower, 1.0 / jnp.diagonal(self.lower)))(eye)
+            inverse = _unrolled_gram(_unrolled_inverse(self.lower))
         else:
-            rows = solve_triangular(self.lower, eye, lower=True).T
-        inverse = matmul(rows, rows.T)
+            inverse_lower = solve_triangular(self.lower, jnp.eye(size, dtype=self.scale.dtype), lower=True)
+            inverse = matmul(inverse_lower.T, inverse_lower)
         return inverse * self.scale[:, None] * self.scale[None, :]
 
 
@@ -110,6 +107,32 @@ def _unrolled_cholesky(scaled: Float[Array, "d d"]) -> tuple[Float[Array, "d d"]
                 value = value - rows[i][k] * rows[j][k]
             rows[i][j] = jnp.where(bad, 0.0, value * inverse)
     return jnp.stack([jnp.stack(row) for row in rows]), jnp.stack(lost)
+
+
+def _unrolled_inverse(lower: Float[Array, "d d"]) -> list[list[Array]]:
+    """Rows of the inverse of a lower triangular matrix, up to the diagonal."""
+    rows: list[list[Array]] = []
+    for i in range(lower.shape[0]):
+        pivot = 1.0 / lower[i, i]
+        row = []
+        for j in range(i):
+            value = lower[i, j] * rows[j][j]
+            for k in range(j + 1, i):
+                value = value + lower[i, k] * rows[k][j]
+            row.append(-value * pivot)
+        rows.append([*row, pivot])
+    return rows
+
+
+def _unrolled_gram(rows: list[list[Array]]) -> Float[Array, "d d"]:
+    """``M^T M`` of a lower triangular matrix."""
+    size = len(rows)
+    entry = {}
+    for i in range(size):
+        for j in range(i + 1):
+            terms = [rows[k][i] * rows[k][j] for k in range(i, size)]
+            entry[i, j] = entry[j, i] = sum(terms[1:], start=terms[0])
+    return jnp.stack([jnp.stack([entry[i, j] for j in range(size)]) for i in range(size)])
 
 
 def _guarded_cholesky(scaled: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Bool[Array, " d"]]:

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxloc.poses import retract, tangent_dimension
 from jaxloc.poses.group import matmul
+from jaxloc.solvers.linear import factor
 from jaxloc.solvers.robust import Loss, Quadratic
 
 
@@ -47,6 +48,11 @@ class Problem(eqx.Module):
         zero = jnp.zeros(tangent_dimension(state), float_dtype(state))
         residual, push = jax.linearize(lambda delta: self.residual(retract(state, delta)), zero)
         return Linearization(residual, jax.vmap(push)(jnp.eye(zero.size, dtype=zero.dtype)))
+
+    def admissible(self, state: Any) -> Bool[Array, ""]:
+        """Whether a minimum makes sense under the model; True unless overridden."""
+        del state
+        return jnp.array(True)
 
     def hessian(self, state: Any) -> Float[Array, "d d"]:
         """Exact Hessian of the cost along the tangent at a minimum, kernels included: what derivatives of it need.
@@ -180,34 +186,63 @@ def _weight_and_slope(kernel: Loss, squared: Float[Array, " n"]) -> tuple[Float[
     return jax.jvp(kernel.weight, (squared,), (jnp.ones_like(squared),))
 
 
+class _Scores(NamedTuple):
+    """What one block of residuals adds to the sandwich.
+
+    Attributes:
+        bread: curvature of its cost.
+        score: derivative of each item's cost along the tangent; None for plain least squares.
+        leverage: function of the inverse bread: the share that each item has in its own fit.
+    """
+
+    bread: Float[Array, "d d"]
+    score: Float[Array, "d n"] | None
+    leverage: Callable[[Array], Array] | None
+
+
 def sandwich(problem: Problem, state: Any) -> tuple[Float[Array, "d d"], Float[Array, "d d"]]:
     """Bread and meat of the covariance ``A^-1 B A^-1`` of an M-estimate.
 
     Items under a quadratic loss obey the noise model: their ``B`` equals their ``A = J^T J``. Items under a robust
-    kernel need not, so ``A`` is the curvature of rho and ``B`` the spread of the scores that were seen.
+    kernel need not, so ``A`` is the curvature of rho and ``B`` the spread of the scores that were seen, each over one
+    minus its item's leverage: the fit has drawn every residual towards zero (the third kind of MacKinnon and White).
 
     References:
         Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 1967.
+        MacKinnon and White, "Some heteroskedasticity-consistent covariance matrix estimators", 1985.
     """
     linear = problem.linearize(state)
-    bread, meat = [], []
-    for kernel, residual, jacobian in with_losses(problem.loss, linear.residual, linear.jacobian):
-        r = items(residual)
-        j = jacobian.reshape(jacobian.shape[0], -1, r.shape[1])
-        flat = j.reshape(j.shape[0], -1)
-        if isinstance(kernel, Quadratic):
-            product = matmul(flat, flat.T)
-            bread.append(product)
-            meat.append(product)
+    blocks = [
+        _scores(kernel, items(r), j.reshape(j.shape[0], -1, items(r).shape[1]))
+        for kernel, r, j in with_losses(problem.loss, linear.residual, linear.jacobian)
+    ]
+    bread = _total([block.bread for block in blocks])
+    inverse = factor(bread).inverse()
+    meat = []
+    for block in blocks:
+        if block.score is None or block.leverage is None:
+            meat.append(block.bread)
             continue
-        squared = jnp.sum(r**2, axis=0)
-        weight, slope = _weight_and_slope(kernel, squared)
-        score = jnp.sum(j * r[None], axis=1)
-        weighted = (j * weight[None, None, :]).reshape(j.shape[0], -1)
-        bread.append(matmul(weighted, flat.T) + 2.0 * matmul(score * slope[None, :], score.T))
-        scaled = score * weight[None, :]
+        kept = 1.0 - jnp.clip(block.leverage(inverse), 0.0, 0.9)
+        scaled = block.score / kept[None, :]
         meat.append(matmul(scaled, scaled.T))
-    return _total(bread), _total(meat)
+    return bread, _total(meat)
+
+
+def _scores(kernel: Loss, r: Float[Array, "k n"], j: Float[Array, "d k n"]) -> _Scores:
+    flat = j.reshape(j.shape[0], -1)
+    if isinstance(kernel, Quadratic):
+        return _Scores(matmul(flat, flat.T), None, None)
+    weight, slope = _weight_and_slope(kernel, jnp.sum(r**2, axis=0))
+    score = jnp.sum(j * r[None], axis=1)
+    weighted = (j * weight[None, None, :]).reshape(j.shape[0], -1)
+    bread = matmul(weighted, flat.T) + 2.0 * matmul(score * slope[None, :], score.T)
+
+    def leverage(inverse: Array) -> Array:
+        share = jnp.sum(matmul(inverse, weighted) * flat, axis=0)
+        return jnp.mean(share.reshape(r.shape), axis=0)
+
+    return _Scores(bread, score * weight[None, :], leverage)
 
 
 def is_quadratic(loss: Any) -> bool:
