@@ -55,8 +55,8 @@ class Reprojection(Problem):
         return Linearization(_mask(predicted - self.pixels, seen, self.valid, 1.0 / self.sigma), jacobian)
 
     def admissible(self, state: SE3) -> Bool[Array, ""]:
-        """Whether, under plain least squares, every point that counts is ahead of the camera."""
-        return _all_seen(self.camera, state, self.points, self.valid, self.loss)
+        """Whether three points are ahead of the camera and, under plain least squares, every point that counts."""
+        return _enough_seen(self.camera, state, self.points, self.valid, self.loss)
 
     def hessian(self, state: SE3) -> Float[Array, "6 6"]:
         """Exact Hessian at a minimum."""
@@ -105,8 +105,8 @@ class StereoReprojection(Problem):
         return Linearization(self._whitened_error(c, seen), jnp.where(seen[None, None, :], jacobian, 0.0))
 
     def admissible(self, state: SE3) -> Bool[Array, ""]:
-        """Whether, under plain least squares, every point that counts is ahead of the camera."""
-        return _all_seen(self.rig.camera, state, self.points, self.valid, self.loss)
+        """Whether three points are ahead of the camera and, under plain least squares, every point that counts."""
+        return _enough_seen(self.rig.camera, state, self.points, self.valid, self.loss)
 
     def hessian(self, state: SE3) -> Float[Array, "6 6"]:
         """Exact Hessian at a minimum."""
@@ -130,12 +130,14 @@ def _camera_points(
     return (x, y, z), seen
 
 
-def _all_seen(camera: Pinhole, pose: SE3, points: Array, valid: Array, loss: Any) -> Bool[Array, ""]:
-    """Robust kernels take a point behind the camera for an outlier; otherwise the pose or the data are wrong."""
-    if not is_quadratic(loss):
-        return jnp.array(True)
+def _enough_seen(camera: Pinhole, pose: SE3, points: Array, valid: Array, loss: Any) -> Bool[Array, ""]:
+    """Three points at least: rounding can hide that two leave a direction open.
+
+    Robust kernels take a point behind the camera for an outlier; otherwise the pose or the data are wrong.
+    """
     _, seen = _camera_points(camera, pose, points, valid)
-    return jnp.all(seen == valid)
+    enough = jnp.sum(seen) >= 3
+    return enough & jnp.all(seen == valid) if is_quadratic(loss) else enough
 
 
 def _mask(

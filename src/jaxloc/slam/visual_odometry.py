@@ -73,10 +73,11 @@ def estimate_motion(
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxloc as jl
-        >>> drive = jl.data.simulate_stereo_points(key=jax.random.key(0), num_frames=2)
+        >>> rig = jl.data.simulate_points.kitti_rig()
+        >>> drive = jl.data.simulate_stereo_points(key=jax.random.key(0), rig=rig, num_frames=2)
         >>> pair = jax.tree.map(lambda leaf: leaf[0], drive.pairs)
         >>> matches = jl.refinement.StereoMatches.of(pair.previous, pair.current, None, None, None)
-        >>> found = jl.slam.estimate_motion(drive.rig, matches, jl.poses.SE3.identity(), key=jax.random.key(1))
+        >>> found = jl.slam.estimate_motion(rig, matches, jl.poses.SE3.identity(), key=jax.random.key(1))
         >>> bool(found.estimate.ok)
         True
     """
