@@ -100,7 +100,10 @@ class Cauchy(Loss):
 
 
 class GemanMcClure(Loss):
-    """Bounded cost: far outliers lose all pull."""
+    """Bounded cost: far outliers lose all pull.
+
+    Groups of outliers that agree make minima of their own: from a start that is far off, use `solve_graduated`.
+    """
 
     scale: Float[Array, ""]
 
