@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import tangent_labels
+from jaxloc.solvers.linear import rank_tolerance
 
 
 class Status(IntEnum):
@@ -76,8 +77,6 @@ class Estimate(eqx.Module):
     @eqx.filter_jit
     def observability(self) -> Observability:
         """Spectrum and rank of the information matrix [K-13]."""
-        from jaxloc.solvers.linear import rank_tolerance
-
         diagonal = jnp.diagonal(self.information)
         known = diagonal > jnp.finfo(diagonal.dtype).tiny
         scale = jnp.where(known, 1.0 / jnp.sqrt(jnp.where(known, diagonal, 1.0)), 1.0)

@@ -18,10 +18,10 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxloc.poses import retract, tangent_dimension
+from jaxloc.poses import retract
 from jaxloc.solvers.estimate import Status
 from jaxloc.solvers.linear import Cholesky, factor
-from jaxloc.solvers.problem import NormalEquations, Problem, items, normal_equations, with_losses
+from jaxloc.solvers.problem import Problem, items, normal_equations, with_losses
 
 
 class Solver(eqx.Module):
@@ -291,14 +291,3 @@ def _where(accept: Bool[Array, ""], new: Any, old: Any) -> Any:
 def _as(leaf: Any, dtype: Any) -> Any:
     """Optimistix starts some scalars in the default dtype; the problem's rules here."""
     return leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf
-
-
-__all__ = [
-    "Dogleg",
-    "GaussNewton",
-    "LevenbergMarquardt",
-    "NormalEquations",
-    "Solver",
-    "TangentSolver",
-    "tangent_dimension",
-]
