@@ -52,7 +52,7 @@ def _p3p(count: int, repeats: int) -> Iterator[Metric]:
 
 def _stereo(count: int, repeats: int) -> Iterator[Metric]:
     """Points with covariance; the peer gives points alone."""
-    rig = jl.data.simulate_points.kitti_rig()
+    rig = jl.data.simulate.points.kitti_rig()
     rng = np.random.default_rng(6)
     depth = rng.uniform(4.0, 60.0, count)
     points = np.stack([rng.uniform(-0.5, 0.5, count) * depth, rng.uniform(-0.2, 0.2, count) * depth, depth], axis=1)
@@ -79,7 +79,7 @@ def _stereo(count: int, repeats: int) -> Iterator[Metric]:
 
 def _coverage(num_trials: int) -> Iterator[Metric]:
     """How often the 95 % ellipsoid of a point 8 m and 40 m away holds the truth."""
-    rig = jl.data.simulate_points.kitti_rig()
+    rig = jl.data.simulate.points.kitti_rig()
     noise = 0.25 * jnp.eye(3, dtype=jnp.float32)
     for depth in (8.0, 40.0):
         point = jnp.array([1.0, 0.5, depth], jnp.float32)

@@ -24,7 +24,7 @@ def metrics(smoke: bool) -> Iterator[Metric]:
 
 def _simulated(num_seeds: int, num_frames: int) -> Iterator[Metric]:
     """300 matches a frame, 0.5 px of noise, a quarter of the matches wrong; drift as the KITTI benchmark has it."""
-    rig = jl.data.simulate_points.kitti_rig()
+    rig = jl.data.simulate.points.kitti_rig()
     keys = jax.random.split(jax.random.key(0), num_seeds)
     drives = [jl.data.simulate_stereo_points(key=key, num_frames=num_frames) for key in keys]
     run = jax.jit(partial(_motions, rig))

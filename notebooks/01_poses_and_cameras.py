@@ -155,7 +155,7 @@ print(jax.jacobian(pixel)(jnp.zeros(6)).round(1))
 # error grows with the square of the distance.
 
 # %%
-rig = jl.data.simulate_points.kitti_rig()
+rig = jl.data.simulate.points.kitti_rig()
 depths = jnp.linspace(4.0, 60.0, 29)
 measured = rig.project(jnp.stack([jnp.zeros_like(depths), jnp.zeros_like(depths), depths], axis=1))
 

@@ -38,7 +38,7 @@ plt.show()
 
 # %%
 drive = jl.data.simulate_stereo_points(key=jax.random.key(0), num_frames=30 if FAST else 300)
-rig = jl.data.simulate_points.kitti_rig()
+rig = jl.data.simulate.points.kitti_rig()
 noise = 0.25 * jnp.eye(3)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxloc.beliefs import chi2_quantile
-from jaxloc.data import simulate_points
+from jaxloc.data.simulate import points as simulate_points
 from jaxloc.poses import SE3
 from jaxloc.refinement import StereoMatches
 from jaxloc.slam import estimate_disparity_offset, estimate_motion

@@ -4,20 +4,16 @@ from jaxloc.data import (
     covariance,
     kitti,
     png,
-    rendering,
     sequence,
-    simulate_camera,
-    simulate_points,
-    simulate_world,
+    simulate,
     tables,
-    textures,
     tum,
     writing,
 )
 from jaxloc.data.kitti import KittiSequence
 from jaxloc.data.sequence import DataError, StereoFrame, StereoSequence
-from jaxloc.data.simulate_camera import StreetSequence, simulate_street
-from jaxloc.data.simulate_points import StereoDrive, StereoPairs, simulate_stereo_points
+from jaxloc.data.simulate.camera import StreetSequence, simulate_street
+from jaxloc.data.simulate.points import StereoDrive, StereoPairs, simulate_stereo_points
 
 __all__ = [
     "DataError",
@@ -30,15 +26,11 @@ __all__ = [
     "covariance",
     "kitti",
     "png",
-    "rendering",
     "sequence",
-    "simulate_camera",
-    "simulate_points",
+    "simulate",
     "simulate_stereo_points",
     "simulate_street",
-    "simulate_world",
     "tables",
-    "textures",
     "tum",
     "writing",
 ]

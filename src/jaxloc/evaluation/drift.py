@@ -83,7 +83,7 @@ def segment_errors(
 
     Example:
         >>> import jaxloc as jl
-        >>> path = jl.data.simulate_points.simulate_drive(60, key=jax.random.key(0))
+        >>> path = jl.data.simulate.points.simulate_drive(60, key=jax.random.key(0))
         >>> errors = segment_errors(path, path, lengths=(10.0, 20.0))
         >>> bool(errors.ok()), bool(errors.translation_percent() < 1e-3)
         (True, True)
@@ -140,7 +140,7 @@ def end_drift_percent(estimate: Trajectory, truth: Trajectory) -> Float[Array, "
 
     Example:
         >>> import jaxloc as jl
-        >>> path = jl.data.simulate_points.simulate_drive(20, key=jax.random.key(0))
+        >>> path = jl.data.simulate.points.simulate_drive(20, key=jax.random.key(0))
         >>> bool(end_drift_percent(path, path) < 1e-3)
         True
     """
@@ -163,7 +163,7 @@ def drift_curve_percent(estimate: Trajectory, truth: Trajectory) -> Float[Array,
 
     Example:
         >>> import jaxloc as jl
-        >>> path = jl.data.simulate_points.simulate_drive(20, key=jax.random.key(0))
+        >>> path = jl.data.simulate.points.simulate_drive(20, key=jax.random.key(0))
         >>> drift_curve_percent(path, path).shape
         (20,)
     """

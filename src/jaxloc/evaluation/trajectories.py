@@ -230,7 +230,7 @@ def ate(
 
     Example:
         >>> import jaxloc as jl
-        >>> path = jl.data.simulate_points.simulate_drive(20, key=jax.random.key(0))
+        >>> path = jl.data.simulate.points.simulate_drive(20, key=jax.random.key(0))
         >>> bool(ate(path, path).rmse() < 1e-4)
         True
     """
@@ -267,7 +267,7 @@ def rpe(
 
     Example:
         >>> import jaxloc as jl
-        >>> path = jl.data.simulate_points.simulate_drive(20, key=jax.random.key(0))
+        >>> path = jl.data.simulate.points.simulate_drive(20, key=jax.random.key(0))
         >>> bool(rpe(path, path).translation.largest() < 1e-4)
         True
     """

@@ -73,7 +73,7 @@ def estimate_motion(
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxloc as jl
-        >>> rig = jl.data.simulate_points.kitti_rig()
+        >>> rig = jl.data.simulate.points.kitti_rig()
         >>> drive = jl.data.simulate_stereo_points(key=jax.random.key(0), rig=rig, num_frames=2)
         >>> pair = jax.tree.map(lambda leaf: leaf[0], drive.pairs)
         >>> matches = jl.refinement.StereoMatches.of(pair.previous, pair.current, None, None, None)

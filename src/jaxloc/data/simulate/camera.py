@@ -1,6 +1,6 @@
 """Stereo images of a synthetic street, with true poses, depths and moving objects.
 
-The images are rendered when they are asked for (:mod:`jaxloc.data.rendering`), always the same ones for a seed.
+The images are rendered when they are asked for (`rendering`), always the same ones for a seed.
 """
 
 from collections.abc import Iterator
@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
-from jaxloc.data.rendering import Intrinsics, Rendering, render
 from jaxloc.data.sequence import StereoFrame
-from jaxloc.data.simulate_world import CAMERA_HEIGHT, Street, make_street
-from jaxloc.data.textures import TextureAtlas, make_street_textures
+from jaxloc.data.simulate.rendering import Intrinsics, Rendering, render
+from jaxloc.data.simulate.textures import TextureAtlas, make_street_textures
+from jaxloc.data.simulate.world import CAMERA_HEIGHT, Street, make_street
 from jaxloc.poses import Trajectory
 from jaxloc.sensors import Pinhole, StereoRig
 

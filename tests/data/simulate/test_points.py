@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxloc.data.simulate_points import kitti_rig, simulate_drive, simulate_pair, simulate_stereo_points
+from jaxloc.data.simulate.points import kitti_rig, simulate_drive, simulate_pair, simulate_stereo_points
 from jaxloc.poses import SE3
 
 

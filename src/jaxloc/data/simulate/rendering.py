@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, Int32
 
-from jaxloc.data.textures import TextureAtlas
+from jaxloc.data.simulate.textures import TextureAtlas
 
 _NEAR = 0.3
 

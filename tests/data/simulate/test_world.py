@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from jaxloc.data.simulate_world import CAMERA_HEIGHT, Road, make_box, make_street
+from jaxloc.data.simulate.world import CAMERA_HEIGHT, Road, make_box, make_street
 
 
 def test_the_road_is_the_integral_of_its_heading():

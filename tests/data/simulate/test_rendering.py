@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from jaxloc.data.rendering import Intrinsics, Rectangles, render
-from jaxloc.data.simulate_world import make_box, make_street, rotation_y
-from jaxloc.data.textures import make_noise, make_street_textures
+from jaxloc.data.simulate.rendering import Intrinsics, Rectangles, render
+from jaxloc.data.simulate.textures import make_noise, make_street_textures
+from jaxloc.data.simulate.world import make_box, make_street, rotation_y
 
 CAMERA = Intrinsics(70.0, 75.0, 39.2, 24.7, 50, 80)
 

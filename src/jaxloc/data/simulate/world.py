@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float64
 
-from jaxloc.data.rendering import Rectangles, join_rectangles
+from jaxloc.data.simulate.rendering import Rectangles, join_rectangles
 
 CAMERA_HEIGHT = 1.65
 _ASPHALT, _WALL, _BODY, _PAINT = 0, 1, 3, 4

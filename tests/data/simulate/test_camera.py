@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxloc.data.simulate_camera import simulate_street
+from jaxloc.data.simulate.camera import simulate_street
 from jaxloc.sensors import Pinhole, StereoRig
 
 SIZE = (120, 384)

@@ -1,0 +1,5 @@
+"""Synthetic worlds that give the library's own records, with exact truth."""
+
+from jaxloc.data.simulate import camera, points, rendering, textures, world
+
+__all__ = ["camera", "points", "rendering", "textures", "world"]
