@@ -24,6 +24,14 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.skip(reason=f"the recordings are not at {RECORDINGS}"))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def quick_compiles(request):
+    """Most tests run a program once: compiling it well costs more than running it badly, but in `heavy` modules."""
+    heavy = request.node.get_closest_marker("heavy") is not None
+    jax.config.update("jax_disable_most_optimizations", not heavy)
+    yield
+
+
 @pytest.fixture
 def recordings() -> Path:
     """The folder with the real recordings."""

@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 
 from jaxloc.beliefs import squareroot
 
@@ -59,3 +60,58 @@ def test_gradient_equals_differences(x64, rng):
         step[i, 1] = 1e-6 * np.sqrt(covariance[i, i] * covariance[1, 1])
         difference = (total(covariance + step) - total(covariance - step)) / (2 * step[i, 1])
         assert np.isclose(gradient[i, 1], difference, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(4, 8), (3, 2), (17, 20)])
+def test_triangularize_equals_numpy(x64, rng, shape):
+    a = rng.normal(size=shape)
+    root = np.asarray(squareroot.triangularize(jnp.asarray(a)))
+    assert np.allclose(root, np.tril(root)) and (np.diag(root) >= 0).all()
+    assert np.allclose(root @ root.T, a @ a.T, atol=1e-12)
+
+
+def test_triangularize_keeps_small_variances(rng):
+    # Variances ten orders of magnitude apart, in float32: the product A A^T would lose the small one.
+    a = np.array([[1e3, 1.0, 0.0], [1e3, 1.0, 1e-2]])
+    root = np.asarray(squareroot.triangularize(jnp.asarray(a, jnp.float32)))
+    exact = np.linalg.qr(a.T, mode="r").T
+    assert np.isclose(root[1, 1], abs(exact[1, 1]), rtol=1e-2)
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (15, 16)])
+def test_triangularize_derivatives(x64, rng, shape):
+    a = jnp.asarray(rng.normal(size=shape))
+    weights = jnp.asarray(rng.normal(size=(shape[0], shape[0])))
+    order = 2 if shape[0] < 9 else 1
+
+    @jax.jit
+    def total(a):
+        return jnp.sum(jnp.sin(squareroot.triangularize(jnp.asarray(a))) * weights)
+
+    check_grads(total, (a,), order=order, rtol=1e-4)
+
+
+def test_triangularize_of_dependent_rows(dtype):
+    a = jnp.asarray([[1.0, 2.0, 0.0], [0.0, 0.0, 0.0], [2.0, 4.0, 0.0], [0.0, 1.0, 3.0]], dtype)
+    root, pull = jax.vjp(squareroot.triangularize, a)
+    (gradient,) = pull(jnp.ones_like(root))
+    assert root.dtype == dtype and np.isfinite(gradient).all()
+    assert np.allclose(root @ root.T, a @ a.T, atol=1e-5)
+    # A row that depends on another turns with it: the derivative of the product still holds.
+    _, change = jax.jvp(squareroot.triangularize, (a,), (a,))
+    assert np.allclose(change, root, atol=1e-5)
+
+
+def test_downdate(x64, rng):
+    root = np.linalg.cholesky(np.asarray(spd(rng, 4)))
+    vector = 0.3 * root @ rng.normal(size=4)
+    found = np.asarray(squareroot.downdate(jnp.asarray(root), jnp.asarray(vector)))
+    assert np.allclose(found @ found.T, root @ root.T - np.outer(vector, vector), rtol=1e-9, atol=1e-12)
+
+
+def test_downdate_never_fails(dtype):
+    eye = jnp.eye(3, dtype=dtype)
+    for root in (eye, jnp.zeros_like(eye)):
+        for length in (1.0, 5.0, 1e6):
+            found, pull = jax.vjp(squareroot.downdate, root, length * eye[0])
+            assert np.isfinite(found).all() and all(np.isfinite(part).all() for part in pull(found))

@@ -138,13 +138,13 @@ def test_gradient_equals_differences(name, x64, rng):
     assert abs(difference - float(forward)) <= 1e-7 * abs(float(forward))
 
 
-@pytest.mark.parametrize("name", LOSSES)
-def test_single_precision_gradient(name, rng):
+def test_single_precision_gradient(rng):
+    loss = LOSSES["geman_mcclure"]
     with jax.enable_x64(True):
         data = noisy_alignment(rng, outliers=0.3)
-        expected = jax.tree.map(np.asarray, first_derivatives(data, directions(data, rng), LOSSES[name]())[2])
+        expected = jax.tree.map(np.asarray, first_derivatives(data, directions(data, rng), loss())[2])
     single = {key: jnp.asarray(np.asarray(x), jnp.float32) for key, x in data.items()}
-    gradient = first_derivatives(single, jax.tree.map(jnp.zeros_like, single), LOSSES[name]())[2]
+    gradient = first_derivatives(single, jax.tree.map(jnp.zeros_like, single), loss())[2]
     for key in ("source", "target"):
         assert gradient[key].dtype == np.float32
         error = np.linalg.norm(gradient[key] - expected[key]) / np.linalg.norm(expected[key])
@@ -240,7 +240,8 @@ def test_new_numbers_compile_nothing(rng):
 
 
 @pytest.mark.parametrize("place", ["target", "sigma", "start"])
-def test_numbers_that_are_not_finite(place, dtype, rng):
+def test_numbers_that_are_not_finite(place, rng):
+    dtype = np.float32
     data, start = noisy_alignment(rng, dtype), near_start(dtype)
 
     @jax.jit

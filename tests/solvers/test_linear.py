@@ -20,7 +20,7 @@ def answers(matrix, vector):
     return found.solve(vector), found.inverse(), found.deficient
 
 
-@pytest.mark.parametrize("size", range(1, 13))
+@pytest.mark.parametrize("size", [1, 2, 6, 9, 12])
 def test_solve_and_inverse_equal_numpy(size, x64, rng):
     matrix, vector = positive(rng, size, spread=1e3), rng.normal(size=size)
     solution, inverse, deficient = answers(jnp.asarray(matrix), jnp.asarray(vector))
@@ -40,7 +40,7 @@ def test_single_precision(size, rng):
     np.testing.assert_allclose(inverse, np.linalg.inv(matrix), rtol=2e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("size", [3, 6, 12])
+@pytest.mark.parametrize("size", [6, 12])
 @pytest.mark.parametrize("kind", ["rank one less", "zero row", "all zero", "nan"])
 def test_deficient_matrices_are_flagged_and_finite(size, kind, dtype, rng):
     root = rng.normal(size=(size, size - 1 if kind == "rank one less" else size + 2))

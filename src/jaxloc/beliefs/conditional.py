@@ -34,11 +34,23 @@ class Motion(eqx.Module):
         """The moved state and the Jacobian between the tangent spaces of both; override where it is short."""
         return _linearize(lambda x: self.move(x, control), state)
 
-    def sample(self, state: Any, control: Any, *, key: Key[Array, ""]) -> Any:
-        """One random next state; override where the noise has a simpler form than its covariance."""
+    def noise_dimension(self, state: Any) -> int:
+        """How many standard normal numbers `perturb` takes: those of the tangent, unless it is overridden."""
+        return tangent_dimension(state)
+
+    def perturb(self, state: Any, control: Any, normal: Float[Array, " k"]) -> Any:
+        """The next state that standard normal numbers lead to: ``retract(move(x, u), L n)``, ``L L^T = covariance``.
+
+        Particle filters draw the numbers of all particles at once and map this over them. Override it (and
+        `noise_dimension`) where noise has a simpler form, or is not a normal in the tangent space.
+        """
         root = cholesky(self.covariance(state, control))
-        normal = jax.random.normal(key, root.shape[:1], root.dtype)
         return retract(self.move(state, control), matmul(root, normal))
+
+    def sample(self, state: Any, control: Any, *, key: Key[Array, ""]) -> Any:
+        """One random next state: `perturb` by fresh numbers."""
+        normal = jax.random.normal(key, (self.noise_dimension(state),), dtype_of(state))
+        return self.perturb(state, control, normal)
 
     def log_prob(self, state: Any, control: Any, moved: Any) -> Float[Array, ""]:
         """Log density of a next state."""
@@ -134,6 +146,17 @@ def log_normal(
     return -0.5 * squared - jnp.sum(jnp.log(jnp.diagonal(root))) - 0.5 * math.log(2.0 * math.pi) * count
 
 
+def dtype_of(value: Any) -> Any:
+    """The dtype of the floating arrays of a pytree.
+
+    Example:
+        >>> import jaxloc as jl
+        >>> jl.beliefs.conditional.dtype_of(jl.poses.SE2(0.0, 0.0, 0.0)).name
+        'float32'
+    """
+    return jnp.result_type(*[leaf for leaf in jax.tree.leaves(value) if eqx.is_inexact_array(leaf)])
+
+
 def _finite_or(value: Any, fallback: Any) -> Any:
     if not eqx.is_inexact_array(value):
         return value
@@ -146,5 +169,4 @@ def _linearize(function: Any, state: Any) -> tuple[Any, Array]:
     def in_tangent(delta):
         return local(image, function(retract(state, delta)))
 
-    dtype = jnp.result_type(*[leaf for leaf in jax.tree.leaves(state) if eqx.is_inexact_array(leaf)])
-    return image, jax.jacfwd(in_tangent)(jnp.zeros(tangent_dimension(state), dtype))
+    return image, jax.jacfwd(in_tangent)(jnp.zeros(tangent_dimension(state), dtype_of(state)))

@@ -70,3 +70,29 @@ def demo(
     from jaxloc.cli import odometry as command
 
     return command.run_demo(out, config, num_frames=frames, seed=seed)
+
+
+@app.command()
+def localize(
+    log: Annotated[Path, typer.Argument(help="CARMEN laser log (FLASER or ROBOTLASER1), plain, .gz or .bz2.")],
+    map_path: Annotated[
+        Path, typer.Option("--map", metavar="MAP.yaml", help="Occupancy map in the format of the ROS map server.")
+    ],
+    start: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--start", metavar="X Y THETA", help="Pose at the first scan, m and rad; anywhere by default."),
+    ] = None,
+    reference: Annotated[
+        Path | None,
+        typer.Option("--reference", metavar="FILE", help="Poses in the map (TUM format), to measure the error."),
+    ] = None,
+    out: _Out = Path("out"),
+    config: _Config = None,
+) -> int:
+    """Find a robot in a map by its laser, and follow it.
+
+    Writes trajectory.tum (times of the log, frame of the map), spread.csv, metrics.json, report.html and config.yaml.
+    """
+    from jaxloc.cli import localize as command
+
+    return command.run_log(log, map_path, start, reference, out, config)

@@ -1,36 +1,53 @@
 """Files and synthetic worlds that give the library's own records."""
 
 from jaxloc.data import (
+    carmen,
     covariance,
     kitti,
+    landmarks,
+    laser_log,
+    maps,
+    planar,
     png,
     sequence,
     simulate,
     tables,
     tum,
+    wean,
     writing,
 )
 from jaxloc.data.kitti import KittiSequence
+from jaxloc.data.laser_log import LaserLog
 from jaxloc.data.sequence import DataError, StereoFrame, StereoSequence
 from jaxloc.data.simulate.camera import StreetSequence, simulate_street
+from jaxloc.data.simulate.laser import LaserDrive, simulate_laser_drive
 from jaxloc.data.simulate.points import StereoDrive, StereoPairs, simulate_stereo_points
 
 __all__ = [
     "DataError",
     "KittiSequence",
+    "LaserDrive",
+    "LaserLog",
     "StereoDrive",
     "StereoFrame",
     "StereoPairs",
     "StereoSequence",
     "StreetSequence",
+    "carmen",
     "covariance",
     "kitti",
+    "landmarks",
+    "laser_log",
+    "maps",
+    "planar",
     "png",
     "sequence",
     "simulate",
+    "simulate_laser_drive",
     "simulate_stereo_points",
     "simulate_street",
     "tables",
     "tum",
+    "wean",
     "writing",
 ]

@@ -1,6 +1,6 @@
 """Metrics, plots and reports."""
 
-from jaxloc.evaluation import alignments, consistency, drift, plot, report, trajectories
+from jaxloc.evaluation import alignments, consistency, drift, plot, plot_map, report, trajectories
 from jaxloc.evaluation.alignments import NoAlignment, RigidAlignment, SimilarityAlignment
 from jaxloc.evaluation.drift import SegmentErrors, end_drift_percent, segment_errors
 from jaxloc.evaluation.report import Section
@@ -20,6 +20,7 @@ __all__ = [
     "drift",
     "end_drift_percent",
     "plot",
+    "plot_map",
     "report",
     "rpe",
     "segment_errors",

@@ -20,8 +20,8 @@ from jaxloc.poses import SE3
 from jaxloc.refinement import StereoMatches
 from jaxloc.sensors import StereoRig
 from jaxloc.slam import (
+    CameraMotion,
     MatchingOptions,
-    Motion,
     MotionOptions,
     StereoFeatures,
     estimate_disparity_offset,
@@ -169,7 +169,7 @@ def calibrate_disparity(frames: Iterable[Any], rig: StereoRig, config: Config | 
 
 def _run(
     frames: Iterable[Any], rig: StereoRig, config: Config
-) -> Iterator[tuple[Step, tuple[StereoMatches, Motion] | None]]:
+) -> Iterator[tuple[Step, tuple[StereoMatches, CameraMotion] | None]]:
     """Steps, with what they were made of."""
     keys = _keys(config.seed)
     keyframe: _Keyframe | None = None
@@ -203,7 +203,7 @@ def _measure(
     key: Key[Array, ""],
     config: Config,
     watch: _Stopwatch,
-) -> tuple[StereoMatches, Motion]:
+) -> tuple[StereoMatches, CameraMotion]:
     """Matches with the keyframe and the motion since then."""
     with watch.stage("track"):
         matches = match_frames(rig, keyframe.features, features, prediction, options=config.matching)
@@ -282,7 +282,7 @@ def _first_step(frame: Any, pose: Gaussian, watch: _Stopwatch) -> Step:
 
 
 def _step(
-    frame: Any, pose: Gaussian, relative: Gaussian, matches: Any, found: Motion, ok: bool, watch: _Stopwatch
+    frame: Any, pose: Gaussian, relative: Gaussian, matches: Any, found: CameraMotion, ok: bool, watch: _Stopwatch
 ) -> Step:
     valid, inlier = np.asarray(matches.valid), np.asarray(found.inliers)
     return Step(

@@ -1,17 +1,49 @@
 """What is measured: forward models of cameras and stereo rigs, and their records."""
 
-from jaxloc.sensors import camera, distortion, rig
+from jaxloc.sensors import camera, ceiling, distortion, increments, landmarks, laser, maps, odometer, ranging, rig
 from jaxloc.sensors.camera import Pinhole
+from jaxloc.sensors.ceiling import CeilingMosaic, CeilingSensor
 from jaxloc.sensors.distortion import BrownConrady, KannalaBrandt, Lens
+from jaxloc.sensors.increments import Increment, IncrementMotion
+from jaxloc.sensors.landmarks import RangeBearing, RangeBearingSensor
+from jaxloc.sensors.laser import BeamModel, LaserScan, LikelihoodField
+from jaxloc.sensors.maps import DistanceField, FreeSpace, OccupancyMap
+from jaxloc.sensors.odometer import DifferentialDrive, OdometryMotion
+from jaxloc.sensors.ranging import Range, RangeSensor, RangingMotion, RangingState
 from jaxloc.sensors.rig import StereoRig
 
 __all__ = [
+    "BeamModel",
     "BrownConrady",
+    "CeilingMosaic",
+    "CeilingSensor",
+    "DifferentialDrive",
+    "DistanceField",
+    "FreeSpace",
+    "Increment",
+    "IncrementMotion",
     "KannalaBrandt",
+    "LaserScan",
     "Lens",
+    "LikelihoodField",
+    "OccupancyMap",
+    "OdometryMotion",
     "Pinhole",
+    "Range",
+    "RangeBearing",
+    "RangeBearingSensor",
+    "RangeSensor",
+    "RangingMotion",
+    "RangingState",
     "StereoRig",
     "camera",
+    "ceiling",
     "distortion",
+    "increments",
+    "landmarks",
+    "laser",
+    "maps",
+    "odometer",
+    "ranging",
     "rig",
 ]

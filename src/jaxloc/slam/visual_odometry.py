@@ -32,7 +32,7 @@ class MotionOptions(eqx.Module):
     min_inliers: int = eqx.field(static=True, default=15)
 
 
-class Motion(eqx.Module):
+class CameraMotion(eqx.Module):
     """A motion between two frames.
 
     Attributes:
@@ -52,7 +52,7 @@ def estimate_motion(
     *,
     key: Key[Array, ""],
     options: MotionOptions = MotionOptions(),
-) -> Motion:
+) -> CameraMotion:
     """Motion of a stereo rig between two frames, from matches with outliers.
 
     The best of the prediction and of many P3P samples starts a graduated robust refinement of the errors-in-variables
@@ -90,7 +90,7 @@ def estimate_motion(
     final = motion_problem(rig, eqx.tree_at(lambda m: m.valid, matches, inliers), rough, Quadratic())
     estimate = solve(final, rough, max_steps=15)
     enough = jnp.sum(inliers) >= options.min_inliers
-    return Motion(eqx.tree_at(lambda e: e.ok, estimate, estimate.ok & enough), inliers)
+    return CameraMotion(eqx.tree_at(lambda e: e.ok, estimate, estimate.ok & enough), inliers)
 
 
 class _OffsetMotion(Problem):
@@ -112,7 +112,7 @@ class _OffsetMotion(Problem):
 
 
 @eqx.filter_jit
-def estimate_disparity_offset(rig: StereoRig, matches: StereoMatches, motion: Motion) -> Estimate:
+def estimate_disparity_offset(rig: StereoRig, matches: StereoMatches, motion: CameraMotion) -> Estimate:
     """The constant error of the measured disparities that best explains a motion: near and far points then agree.
 
     A disparity that is too small by a constant makes far points move too far. One motion says little about the offset;

@@ -1,5 +1,13 @@
 """Synthetic worlds that give the library's own records, with exact truth."""
 
-from jaxloc.data.simulate import camera, points, rendering, textures, world
+from jaxloc.data.simulate import camera, landmarks, laser, points, rendering, textures, world
 
-__all__ = ["camera", "points", "rendering", "textures", "world"]
+__all__ = [
+    "camera",
+    "landmarks",
+    "laser",
+    "points",
+    "rendering",
+    "textures",
+    "world",
+]

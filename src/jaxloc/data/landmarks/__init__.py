@@ -1,0 +1,18 @@
+"""Drives among point landmarks, as the steps of a filter."""
+
+from jaxloc.data.landmarks import factors, log, mrclam, ranging
+from jaxloc.data.landmarks.factors import read_factors
+from jaxloc.data.landmarks.log import LandmarkLog
+from jaxloc.data.landmarks.mrclam import read_mrclam
+from jaxloc.data.landmarks.ranging import read_ranging
+
+__all__ = [
+    "LandmarkLog",
+    "factors",
+    "log",
+    "mrclam",
+    "ranging",
+    "read_factors",
+    "read_mrclam",
+    "read_ranging",
+]

@@ -1,0 +1,82 @@
+"""Planar poses (x, y, heading) as rows of host arrays: what readers and simulators compute before records are made."""
+
+import numpy as np
+from jaxtyping import Float64
+
+
+def relative_poses(before: Float64[np.ndarray, "n 3"], after: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    """Motions (x, y, heading) from one pose to another: ``T_a^-1 T_b``, headings in [-pi, pi).
+
+    Args:
+        before: poses (x, y, heading), m and rad.
+        after: poses in the same frame.
+
+    Returns:
+        Each pose of ``after`` in the frame of its partner.
+
+    Example:
+        >>> relative_poses(np.array([[1.0, 0.0, np.pi / 2]]), np.array([[1.0, 2.0, np.pi / 2]])).round(3).tolist()
+        [[2.0, 0.0, 0.0]]
+    """
+    shift = after[:, :2] - before[:, :2]
+    cos, sin = np.cos(before[:, 2]), np.sin(before[:, 2])
+    turn = (after[:, 2] - before[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    return np.stack([cos * shift[:, 0] + sin * shift[:, 1], cos * shift[:, 1] - sin * shift[:, 0], turn], axis=1)
+
+
+def compose_poses(first: Float64[np.ndarray, "n 3"], then: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    """Poses after motions: ``T_a T_b``, the inverse of `relative_poses`.
+
+    Args:
+        first: poses (x, y, heading), m and rad.
+        then: motions in the frames of these.
+
+    Returns:
+        Poses; headings are not wrapped.
+
+    Example:
+        >>> compose_poses(np.array([[1.0, 0.0, np.pi / 2]]), np.array([[2.0, 0.0, 0.0]])).round(3).tolist()
+        [[1.0, 2.0, 1.571]]
+    """
+    cos, sin = np.cos(first[:, 2]), np.sin(first[:, 2])
+    x = first[:, 0] + cos * then[:, 0] - sin * then[:, 1]
+    y = first[:, 1] + sin * then[:, 0] + cos * then[:, 1]
+    return np.stack([x, y, first[:, 2] + then[:, 2]], axis=1)
+
+
+def dead_reckon(
+    times: Float64[np.ndarray, " n"], twists: Float64[np.ndarray, "n 2"], at: Float64[np.ndarray, " t"]
+) -> Float64[np.ndarray, "t 3"]:
+    """Poses reached by velocities that hold from their stamps to the next, exact on each arc.
+
+    Args:
+        times: stamps of the velocities, s, increasing.
+        twists: forward velocity (m/s) and turn rate (rad/s).
+        at: moments asked for, s; the robot stands still before the first stamp.
+
+    Returns:
+        (x, y, theta), from the pose at the first stamp as origin.
+    """
+    headings = np.r_[0.0, np.cumsum(twists[:-1, 1] * np.diff(times))]
+    arcs = _arc(headings[:-1], twists[:-1], np.diff(times))
+    nodes = np.column_stack([np.vstack([np.zeros((1, 2)), np.cumsum(arcs, axis=0)]), headings])
+    row = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 1)
+    since = np.maximum(at - times[row], 0.0)
+    rest = np.column_stack([_arc(nodes[row, 2], twists[row], since), twists[row, 1] * since])
+    return nodes[row] + rest
+
+
+def _arc(headings: np.ndarray, twists: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Displacements along arcs of constant velocity."""
+    turn = twists[:, 1] * seconds
+    chord = twists[:, 0] * seconds * np.sinc(turn / (2.0 * np.pi))
+    middle = headings + 0.5 * turn
+    return np.stack([chord * np.cos(middle), chord * np.sin(middle)], axis=1)
+
+
+def interpolate_poses(
+    times: Float64[np.ndarray, " n"], poses: Float64[np.ndarray, "n 3"], at: Float64[np.ndarray, " t"]
+) -> Float64[np.ndarray, "t 3"]:
+    """Planar poses between stamps: straight lines, headings the short way round."""
+    headings = np.unwrap(poses[:, 2])
+    return np.stack([np.interp(at, times, column) for column in (*poses[:, :2].T, headings)], axis=1)

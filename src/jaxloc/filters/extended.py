@@ -1,0 +1,137 @@
+"""The extended Kalman filter on any manifold: iterated, gated, robust."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from jaxloc.beliefs import Motion, Sensor
+from jaxloc.beliefs.conditional import innovation
+from jaxloc.beliefs.squareroot import product, whiten
+from jaxloc.filters.contract import GaussianInfo, GaussianState
+from jaxloc.filters.kalman import (
+    GaussianFilter,
+    Reading,
+    Spread,
+    carry,
+    is_flat,
+    judge,
+    noise_root,
+    read_linearized,
+    regular,
+    settle,
+    spread_motion,
+    spread_reading,
+)
+from jaxloc.poses import retract
+from jaxloc.solvers.robust import Loss, Quadratic
+
+_SMALLEST_WEIGHT = 1e-8  # of a robust kernel: the noise of a rejected measurement grows by ten thousand
+
+
+class ExtendedKalmanFilter(GaussianFilter):
+    """Models linearized where the state is; states are vectors, poses, or any pytree of them.
+
+    An update is Gauss-Newton on ``|local(x-, x)|^2_P + |z - h(x)|^2_R``. One iteration is the usual extended filter;
+    more of them linearize again where the last one ended. The covariance of a pose is carried to the tangent space of
+    its new mean. What the info says (innovation, NIS, likelihood) is of the linearization at the predicted state.
+
+    Args:
+        motion: how the state moves.
+        sensor: what is measured.
+        iterations: Gauss-Newton steps of an update, at least 1.
+        gate: probability that a right measurement passes the chi-square gate; one that does not leaves the state as it
+            was, and counts nothing in the likelihood. None for no gate.
+        loss: robust kernel of the whole measurement, in sigmas: the noise covariance is divided by its weight, which
+            is taken at the innovation in the first iteration and at the residual after that.
+
+    Raises:
+        ValueError: if iterations or gate are out of range.
+
+    References:
+        Bell and Cathey, "The iterated Kalman filter update as a Gauss-Newton method", IEEE TAC 1993; Bourmaud et al.,
+        "Continuous-discrete extended Kalman filter on matrix Lie groups", 2015 [T-57], [K-79].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> motion = jl.filters.TwistMotion(0.01 * jnp.eye(3))
+        >>> class Position(jl.beliefs.Sensor):
+        ...     def expect(self, state, measurement):
+        ...         return state.translation
+        ...     def covariance(self, state, measurement):
+        ...         return 0.01 * jnp.eye(2)
+        >>> filt = jl.filters.ExtendedKalmanFilter(motion, Position(), iterations=3)
+        >>> state = filt.init(jl.beliefs.Gaussian(jl.poses.SE2.identity(), 0.1 * jnp.eye(3)))
+        >>> step = jl.filters.BodyTwist(jnp.array([1.0, 0.0, 0.0]), jnp.array(1.0))
+        >>> state, info = filt.update(filt.predict(state, step), jnp.array([1.0, 0.5]), jnp.array(True))
+        >>> bool(jnp.allclose(state.mean.translation, jnp.array([1.0, 0.5]), atol=0.05)), bool(state.mean.theta > 0)
+        (True, True)
+    """
+
+    motion: Motion
+    sensor: Sensor
+    iterations: int = eqx.field(static=True, default=1)
+    gate: float | None = eqx.field(static=True, default=None)
+    loss: Loss = eqx.field(default_factory=Quadratic)
+
+    def __check_init__(self):
+        if self.iterations < 1:
+            raise ValueError(f"An update needs at least 1 iteration; got {self.iterations}.")
+        if self.gate is not None and not 0.0 < self.gate < 1.0:
+            raise ValueError(f"The gate is a probability between 0 and 1; got {self.gate}.")
+
+    def move(self, state: GaussianState, control: Any) -> Spread:
+        """By the derivative of the motion."""
+        return spread_motion(self.motion, state, control)
+
+    def read(self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]) -> Reading:
+        """By the derivative of the sensor at the mean."""
+        return read_linearized(self.sensor, state, measurement, valid)
+
+    def update(
+        self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
+    ) -> tuple[GaussianState, GaussianInfo]:
+        """The state given a measurement."""
+        del key
+        reading = self.read(state, measurement, valid)
+        root = reading.spread.root()
+        info = judge(root, reading, self.gate)
+        if not isinstance(self.loss, Quadratic):
+            root = _reweighted(reading.spread, self.loss.weight(info.nis)).root()
+        delta, rest = _step(root, info.innovation)
+        for _ in range(self.iterations - 1):
+            safe = jnp.where(info.ok & info.accepted & jnp.all(jnp.isfinite(delta)), delta, 0.0)
+            delta, rest = self._again(state, measurement, reading.mask, safe)
+        return settle(state, delta, rest, info), info
+
+    def _again(
+        self, state: GaussianState, measurement: Any, mask: Bool[Array, " m"], delta: Float[Array, " d"]
+    ) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
+        """A Gauss-Newton step from a point ``delta`` away from the prior mean, in the tangent space of that mean."""
+        value = retract(state.mean, delta)
+        expected, jacobian = self.sensor.linearize(value, measurement)
+        residual, mask = innovation(expected, measurement, mask)
+        noise, mask = noise_root(self.sensor.covariance(value, measurement), mask)
+        jacobian = jnp.where(mask[:, None], jacobian, 0.0)
+        if not is_flat(state.mean):
+            jacobian = product(jacobian, carry(state.mean, delta, value))
+        residual = jnp.where(mask, residual, 0.0)
+        spread = spread_reading(expected, noise, product(jacobian, state.covariance_sqrt), state)
+        if not isinstance(self.loss, Quadratic):
+            spread = _reweighted(spread, self.loss.weight(jnp.sum(whiten(noise, residual) ** 2)))
+        return _step(spread.root(), residual + product(jacobian, delta))
+
+
+def _step(root: Float[Array, "n n"], residual: Float[Array, " m"]) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
+    """The most probable tangent given an innovation, and the root of what remains uncertain."""
+    size = residual.shape[0]
+    return product(root[size:, :size], whiten(regular(root[:size, :size]), residual)), root[size:, size:]
+
+
+def _reweighted(spread: Spread, weight: Float[Array, ""]) -> Spread:
+    """The spread with the measurement noise divided by a weight."""
+    size = spread.image.shape[0]
+    larger = 1.0 / jnp.sqrt(jnp.maximum(weight, _SMALLEST_WEIGHT))
+    image = jnp.concatenate([spread.image[:, :size] * larger, spread.image[:, size:]], axis=1)
+    return Spread(spread.mean, image, spread.source)

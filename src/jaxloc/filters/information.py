@@ -1,0 +1,191 @@
+"""The Kalman filter in information form: it can begin from knowing nothing at all."""
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from jaxloc.beliefs import Gaussian, Motion, Sensor
+from jaxloc.beliefs.conditional import innovation
+from jaxloc.beliefs.squareroot import cholesky, solve, triangularize, whiten
+from jaxloc.filters.contract import Filter, FilterState, GaussianState, Info
+from jaxloc.filters.kalman import finite_or_zero, noise_root, select
+from jaxloc.poses.group import matmul
+
+
+class InformationState(FilterState):
+    """Equations ``L^T x = b + e`` with unit noise e: what is known of a vector, which may be nothing.
+
+    Attributes:
+        information_sqrt: lower triangular L; ``L L^T`` is the information matrix.
+        target: b.
+        step: how many predictions led here.
+    """
+
+    information_sqrt: Float[Array, "d d"]
+    target: Float[Array, " d"]
+    step: Int[Array, ""]
+
+    @property
+    def information(self) -> Float[Array, "d d"]:
+        """The information matrix, the inverse of the covariance."""
+        return matmul(self.information_sqrt, self.information_sqrt.mT)
+
+    @property
+    def determined(self) -> Bool[Array, ""]:
+        """Whether every direction is known, so that there is a mean and a covariance."""
+        return jnp.all(_known(self.information_sqrt))
+
+    @property
+    def mean(self) -> Float[Array, " d"]:
+        """The most probable vector; zero along directions that nothing is known of."""
+        return _back(self.information_sqrt, self.target)
+
+    def gaussian(self) -> Gaussian:
+        """The state as a density; its covariance means something only where `determined`."""
+        root = _inverse(self.information_sqrt)
+        return Gaussian(self.mean, matmul(root.T, root))
+
+
+class InformationInfo(Info):
+    """What an update in information form says.
+
+    Attributes:
+        log_likelihood: of the measurement given all earlier ones; zero while the state is not determined, for what is
+            unknown has no density.
+        ok: whether the state can be used.
+        nis: squared misfit of the measurement with what was known; chi-square with `dof` degrees of freedom.
+        dof: number of valid directions, less those that determined something unknown.
+    """
+
+    log_likelihood: Float[Array, ""]
+    ok: Bool[Array, ""]
+    nis: Float[Array, ""]
+    dof: Int[Array, ""]
+
+
+class InformationFilter(Filter):
+    """The square-root information filter of linear models; the same numbers as `KalmanFilter`, and an exact zero start.
+
+    Predictions and updates stack whitened equations and triangularize them. Nothing is inverted but the transition.
+
+    Args:
+        motion: how a vector moves; linear, with a transition matrix that can be inverted.
+        sensor: what is measured; linear.
+
+    References:
+        Bierman, *Factorization Methods for Discrete Sequential Estimation*, 1977, chapters V and VI; Thesis 2.4.1
+        [T-56].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> eye = jnp.eye(2)
+        >>> filt = jl.filters.InformationFilter(jl.filters.LinearMotion(eye, eye), jl.filters.LinearSensor(eye, eye))
+        >>> state, info = filt.update(filt.predict(filt.nothing(2), None), jnp.array([3.0, 4.0]), jnp.array(True))
+        >>> [round(float(number), 3) for number in state.mean], bool(state.determined), float(info.nis)
+        ([3.0, 4.0], True, 0.0)
+    """
+
+    motion: Motion
+    sensor: Sensor
+
+    def init(self, prior: Gaussian | GaussianState) -> InformationState:
+        """The state of a prior density of a vector."""
+        root = cholesky(prior.covariance)
+        # S^-1 is lower triangular; the equations S^-1 x = S^-1 m are brought to triangular form.
+        inverse = _inverse(root)
+        return _reduce(inverse, matmul(inverse, prior.mean), jnp.zeros((), jnp.int32))[0]
+
+    def nothing(self, size: int, dtype: Any = float) -> InformationState:
+        """The state of knowing nothing of a vector."""
+        return InformationState(jnp.zeros((size, size), dtype), jnp.zeros(size, dtype), jnp.zeros((), jnp.int32))
+
+    def predict(self, state: InformationState, control: Any, *, key: Key[Array, ""] | None = None) -> InformationState:
+        """The state one step later; entries of the control that are not finite count as zero."""
+        del key
+        control, mean = finite_or_zero(control), state.mean
+        moved, transition = self.motion.linearize(mean, control)
+        noise = cholesky(self.motion.covariance(mean, control))
+        size = mean.shape[0]
+        # With x = F^-1 (x' - shift - noise w): equations in (w, x'), of which w is taken out.
+        shift = moved - matmul(transition, mean)
+        rows = jnp.linalg.solve(transition.T, state.information_sqrt).T
+        eye, zero = jnp.eye(size, dtype=mean.dtype), jnp.zeros((size, size), mean.dtype)
+        left = jnp.block([[eye, zero], [-matmul(rows, noise), rows]])
+        right = jnp.concatenate([jnp.zeros_like(mean), state.target + matmul(rows, shift)])
+        root = triangularize(jnp.concatenate([left, right[:, None]], axis=1).T)
+        block = slice(size, 2 * size)
+        after = InformationState(root[block, block], root[2 * size, block], state.step + 1)
+        return select(_finite(after), after, InformationState(state.information_sqrt, state.target, state.step + 1))
+
+    def update(
+        self, state: InformationState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
+    ) -> tuple[InformationState, InformationInfo]:
+        """The state given a measurement."""
+        del key
+        mean = state.mean
+        expected, matrix = self.sensor.linearize(mean, measurement)
+        residual, mask = innovation(expected, measurement, valid)
+        mask = mask & jnp.all(jnp.isfinite(matrix), axis=1)
+        noise, mask = noise_root(self.sensor.covariance(mean, measurement), mask)
+        matrix = whiten(noise, jnp.where(mask[:, None], matrix, 0.0))
+        target = whiten(noise, jnp.where(mask, residual, 0.0)) + matmul(matrix, mean)
+        usable = jnp.isfinite(jnp.sum(lax.stop_gradient(target) ** 2))
+        matrix, target = jnp.where(usable, matrix, 0.0), jnp.where(usable, target, 0.0)
+        rows = jnp.concatenate([state.information_sqrt.T, matrix])
+        after, misfit = _reduce(rows, jnp.concatenate([state.target, target]), state.step)
+        ok = usable & _finite(after)
+        info = self._info(state, after, misfit, noise, jnp.sum(mask), ok)
+        return select(ok & jnp.any(mask), after, state), info
+
+    def _info(
+        self, before: InformationState, after: InformationState, misfit: Array, noise: Array, seen: Array, ok: Array
+    ) -> InformationInfo:
+        gained = jnp.sum(_known(after.information_sqrt)) - jnp.sum(_known(before.information_sqrt))
+        nis = jnp.where(ok, misfit**2, 0.0)
+        volume = _log_volume(after.information_sqrt) - _log_volume(before.information_sqrt)
+        volume = volume + jnp.sum(jnp.log(jnp.diagonal(noise)))
+        likelihood = -0.5 * nis - volume - 0.5 * math.log(2.0 * math.pi) * seen.astype(nis.dtype)
+        counts = ok & before.determined & (seen > 0)
+        return InformationInfo(jnp.where(counts, likelihood, 0.0), ok, nis, seen - gained)
+
+
+def _reduce(rows: Float[Array, "k d"], target: Float[Array, " k"], step: Array) -> tuple[InformationState, Array]:
+    """Equations ``rows x = target`` in triangular form, and the length of what no x can explain."""
+    size = rows.shape[1]
+    root = triangularize(jnp.concatenate([rows, target[:, None]], axis=1).T)
+    return InformationState(root[:size, :size], root[size, :size], step), root[size, size]
+
+
+def _known(root: Float[Array, "d d"]) -> Bool[Array, " d"]:
+    """Which pivots are more than rounding."""
+    floor = 8.0 * float(jnp.finfo(root.dtype).eps) * jnp.sqrt(jnp.sum(lax.stop_gradient(root) ** 2, axis=1))
+    return jnp.diagonal(root) > floor
+
+
+def _safe(root: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """A root in which directions that are not known are cut loose."""
+    known = _known(root)
+    return jnp.where(known[:, None] & known[None, :], root, jnp.eye(root.shape[0], dtype=root.dtype))
+
+
+def _back(root: Float[Array, "d d"], target: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Solves ``L^T x = b``; zero along what is not known."""
+    safe = _safe(root)
+    wanted = jnp.where(_known(root), target, 0.0)
+    return solve(safe, matmul(safe, wanted))
+
+
+def _inverse(root: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    safe = _safe(root)
+    return whiten(safe, jnp.eye(root.shape[0], dtype=root.dtype))
+
+
+def _log_volume(root: Float[Array, "d d"]) -> Float[Array, ""]:
+    return jnp.sum(jnp.log(jnp.where(_known(root), jnp.diagonal(root), 1.0)))
+
+
+def _finite(state: InformationState) -> Bool[Array, ""]:
+    return jnp.isfinite(lax.stop_gradient(jnp.sum(state.information_sqrt) + jnp.sum(state.target)))
