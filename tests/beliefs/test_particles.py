@@ -82,8 +82,8 @@ def test_zero_and_bad_weights():
         cloud = Particles(planar(jnp.arange(3.0), jnp.zeros(3), jnp.zeros(3)), log_weights)
         return cloud.mean().x + cloud.ess + cloud.covariance()[0, 0] + cloud.local_mean(jnp.ones(3)).x
 
-    for log_weights in ([0.0, -jnp.inf, 1.0], [-jnp.inf] * 3, [jnp.nan, 0.0, -1e38]):
-        assert bool(jnp.all(jnp.isfinite(jax.grad(of)(jnp.array(log_weights)))))
+    slopes = jax.jit(jax.vmap(jax.grad(of)))(jnp.array([[0.0, -jnp.inf, 1.0], [-jnp.inf] * 3, [jnp.nan, 0.0, -1e38]]))
+    assert bool(jnp.all(jnp.isfinite(slopes)))
 
 
 def test_masked_particles_are_absent(rng):
@@ -118,7 +118,6 @@ def test_gradients_equal_differences(x64, rng):
     for i in range(2):
         step = 1e-6 * np.eye(2)[i]
         assert np.isclose(gradient[i], (jitted(point + step) - jitted(point - step)) / 2e-6, rtol=1e-6)
-    assert np.isclose(of(point), jitted(point))
 
 
 def test_draws(dtype):

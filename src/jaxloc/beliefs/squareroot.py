@@ -13,6 +13,7 @@ from jaxloc.poses.group import matmul
 
 _UNROLLED = 9  # up to here a loop of column steps beats the library call under vmap
 _UNROLLED_ROWS = 14  # the same for orthogonal factorizations
+_SMALLEST_STACK = 16  # matrices; below, the batch would fill no vector registers
 _LARGEST_PRODUCT = 16  # columns; beyond, the library's product
 
 
@@ -176,6 +177,28 @@ def downdate(root: Float[Array, "d d"], vector: Float[Array, " d"]) -> Float[Arr
 
 @custom_vmap
 def _by_rows(rows: Array) -> Array:
+    return _gram_schmidt(rows)
+
+
+@_by_rows.def_vmap
+def _(axis_size: int, in_batched: list[bool], rows: Array) -> tuple[Array, bool]:
+    del axis_size, in_batched
+    return _by_rows_stacked(rows), True
+
+
+@custom_vmap
+def _by_rows_stacked(stack: Array) -> Array:
+    return _gram_schmidt_stacked(stack) if stack.shape[0] >= _SMALLEST_STACK else jax.vmap(_gram_schmidt)(stack)
+
+
+@_by_rows_stacked.def_vmap
+def _(axis_size: int, in_batched: list[bool], stacks: Array) -> tuple[Array, bool]:
+    del in_batched
+    roots = _by_rows_stacked(stacks.reshape(-1, *stacks.shape[2:]))
+    return roots.reshape(axis_size, -1, *roots.shape[1:]), True
+
+
+def _gram_schmidt(rows: Array) -> Array:
     """Modified Gram-Schmidt: each row leaves its length, and the parts of the later rows along it."""
     size, columns = rows.shape[0], []
     for i in range(size):
@@ -188,12 +211,10 @@ def _by_rows(rows: Array) -> Array:
     return jnp.stack(columns, axis=1)
 
 
-@_by_rows.def_vmap
-def _by_rows_batched(axis_size: int, in_batched: list[bool], rows: Array) -> tuple[Array, bool]:
+def _gram_schmidt_stacked(stack: Array) -> Array:
     """The same with the batch along the last axis, where it fills vector registers: several times as fast."""
-    del axis_size, in_batched
-    size, count = rows.shape[1:3]
-    left = [jnp.moveaxis(rows[:, i], 0, -1) for i in range(size)]
+    size, count = stack.shape[1:]
+    left = [jnp.moveaxis(stack[:, i], 0, -1) for i in range(size)]
     columns = []
     for i in range(size):
         first, *rest = left
@@ -202,7 +223,8 @@ def _by_rows_batched(axis_size: int, in_batched: list[bool], rows: Array) -> tup
         parts = [_dot(row, direction, count) for row in rest]
         left = [row - part[None] * direction for row, part in zip(rest, parts, strict=True)]
         columns.append(jnp.stack([jnp.zeros_like(length)] * i + [length, *parts], axis=-1))
-    return lax.optimization_barrier(jnp.stack(columns, axis=-1)), True
+    # Without the barrier what comes after is merged with the last of this loop, and works it out again and again.
+    return lax.optimization_barrier(jnp.stack(columns, axis=-1))
 
 
 def _dot(a: Array, b: Array, count: int) -> Array:

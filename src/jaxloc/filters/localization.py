@@ -32,6 +32,8 @@ class Recovery(eqx.Module):
         readings: how many independent readings a measurement holds; the fit is the log likelihood over these.
         tolerance: by how much the quick mean may fall behind as scenes change, in nats a reading.
         most: largest part of the cloud that is replaced in one step.
+        doubt: weight of all random poses together before they are compared with a scan: the probability that the robot
+            was carried away. With their share of the cloud instead, one cluttered scan would be enough to believe them.
 
     References:
         Thrun, Burgard, Fox, *Probabilistic Robotics*, 2005, table 8.3 (there with likelihoods in place of their
@@ -43,6 +45,7 @@ class Recovery(eqx.Module):
     readings: float = eqx.field(static=True, default=1.0)
     tolerance: float = eqx.field(static=True, default=0.3)
     most: float = eqx.field(static=True, default=0.9)
+    doubt: float = eqx.field(static=True, default=0.01)
 
     def follow(self, mean: Float[Array, "2"], fit: Float[Array, ""], seen: Int[Array, ""]) -> Float[Array, "2"]:
         """Both running means after one more fit; plain means while there are few."""
@@ -273,7 +276,7 @@ class MonteCarloLocalization(Filter):
         return self.resampling.resample(particles, key=key, count=count).particles
 
     def _inject(self, particles: Particles, share: Array, key: Array) -> Particles:
-        """Random poses in place of a part of the cloud, each with the mean weight."""
+        """Random poses in place of a part of the cloud, with little weight before they have seen a scan."""
         key_choose, key_draw = jax.random.split(key)
         fresh = self.space.sample(particles.size, key=key_draw)
         chosen = jax.random.uniform(key_choose, (particles.size,), share.dtype) < share
@@ -282,7 +285,8 @@ class MonteCarloLocalization(Filter):
             return jnp.where(chosen.reshape(-1, *(1,) * (old.ndim - 1)), new.astype(old.dtype), old)
 
         values = jax.tree.map(swap, fresh, particles.values)
-        level = -jnp.log(jnp.maximum(particles.count, 1).astype(share.dtype))
+        doubt = 0.5 if self.recovery is None else self.recovery.doubt
+        level = math.log(doubt) - jnp.log(jnp.maximum(jnp.sum(chosen), 1).astype(share.dtype))
         return Particles(values, jnp.where(chosen, level, particles.log_weights), particles.valid | chosen).normalize()
 
 

@@ -77,12 +77,20 @@ def run_parallel(
     there = jnp.ones(valid.shape[:1], bool) if active is None else active
     controls = finite_or_zero(controls)
     path = _drive(filt, state, controls, there)
-    for i in range(iterations):
+    num_blocks = min(num_blocks, there.shape[0])
+
+    def linearized(path):
         prior = _seen_from(jax.tree.map(lambda leaf: leaf[0], path), state)
         steps = _linearize(filt, path, controls, measurements, valid, there)
-        filtered, infos = filter_blocks(steps, prior, min(num_blocks, there.shape[0]))
-        if i + 1 < iterations:
-            path = _straighten(path, _tangent_smoothed(steps, prior, filtered, num_blocks))
+        return steps, prior, filter_blocks(steps, prior, num_blocks)
+
+    def again(_, path):
+        steps, prior, (filtered, _) = linearized(path)
+        return _straighten(path, _tangent_smoothed(steps, prior, filtered, num_blocks))
+
+    if iterations > 1:
+        path = lax.fori_loop(0, iterations - 1, again, path)
+    filtered, infos = linearized(path)[2]
     numbers = state.step + jnp.cumsum(there, dtype=state.step.dtype)
     states = jax.vmap(_state)(jax.tree.map(lambda leaf: leaf[1:], path), filtered, numbers)
     return jax.tree.map(lambda leaf: leaf[-1], states), History(states, infos)

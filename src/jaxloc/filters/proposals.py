@@ -227,8 +227,9 @@ def score(log_density: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
     Example:
         >>> import jax, jaxloc as jl
-        >>> jax.value_and_grad(lambda x: jl.filters.proposals.score(x * x))(3.0)
-        (Array(0., dtype=float32), Array(6., dtype=float32, weak_type=True))
+        >>> value, slope = jax.value_and_grad(lambda x: jl.filters.proposals.score(x * x))(3.0)
+        >>> float(value), float(slope)
+        (0.0, 6.0)
     """
     return _score(log_density)
 

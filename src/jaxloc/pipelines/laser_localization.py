@@ -58,8 +58,7 @@ class Config(eqx.Module):
         num_beams: of a scan that are used.
         sigma: of the end points of beams about the walls, m.
         z_hit: part of the beams that end at walls of the map.
-        independent_beams: how many beams a scan is worth while the place is known,
-        independent_beams_global: and while it is not: a wrong guess is hard to give up, a late one costs little.
+        independent_beams: how many beams a scan is worth.
         max_range: longer beams count nothing, m.
         odometry: how it errs.
         min_translation: a scan is used when the robot has moved so far since the last one, m,
@@ -80,7 +79,6 @@ class Config(eqx.Module):
     sigma: float = 0.08
     z_hit: float = 0.9
     independent_beams: float = 20.0
-    independent_beams_global: float = 6.0
     max_range: float = 30.0
     odometry: Odometry = Odometry()
     min_translation: float = 0.1
@@ -98,7 +96,7 @@ class Config(eqx.Module):
         for name in ("num_particles", "num_particles_global", "num_beams", "chunk"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, must be at least 1")
-        for name in ("sigma", "max_range", "independent_beams", "independent_beams_global"):
+        for name in ("sigma", "max_range", "independent_beams"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, must be positive")
         if not 0 < self.z_hit < 1:
@@ -154,9 +152,7 @@ def steps(log: Any, grid: OccupancyMap, start: SE2 | None = None, config: Config
         Thrun, Burgard, Fox, *Probabilistic Robotics*, 2005, chapter 8 [R-11].
     """
     config = Config() if config is None else config
-    tracking = make_filter(log, grid, config)
-    searching = make_filter(log, grid, config, config.independent_beams_global)
-    filt = tracking
+    filt = make_filter(log, grid, config)
     key_start, key_run = jax.random.split(jax.random.key(config.seed))
     if start is None:
         state = filt.start_globally(config.num_particles_global, key=key_start)
@@ -166,7 +162,6 @@ def steps(log: Any, grid: OccupancyMap, start: SE2 | None = None, config: Config
     used = select_scans(log.odometry, config.min_translation, config.min_rotation)
     done, streak, last = 0, 0, None
     for chunk in np.split(used, range(config.chunk, len(used), config.chunk)):
-        filt = tracking if state.particles.size == config.num_particles else searching
         state, kept = _advance(filt, state, log, used, chunk, config, key_run)
         for place in range(len(chunk)):
             for index in range(done, chunk[place]):
@@ -180,16 +175,13 @@ def steps(log: Any, grid: OccupancyMap, start: SE2 | None = None, config: Config
         yield _carried(last, log, index)
 
 
-def make_filter(
-    log: Any, grid: OccupancyMap, config: Config, independent_beams: float | None = None
-) -> MonteCarloLocalization:
+def make_filter(log: Any, grid: OccupancyMap, config: Config) -> MonteCarloLocalization:
     """The filter for a log in a map.
 
     Args:
         log: for the mount of its laser.
         grid: the map.
         config: options.
-        independent_beams: how many beams a scan is worth; that of the options where not given.
 
     Returns:
         The filter.
@@ -199,7 +191,7 @@ def make_filter(
     """
     if not bool(jnp.any(grid.occupied)):
         raise ValueError("The map has no obstacle: nothing to localize by.")
-    options, worth = config.odometry, independent_beams or config.independent_beams
+    options = config.odometry
     names = [name for name in vars(Odometry()) if not name.startswith("_")]
     motion = OdometryMotion(**{name: getattr(options, name) for name in names})
     field = DistanceField.of(grid, ceiling=max(6.0 * config.sigma, 0.5), surfaces=True)
@@ -209,9 +201,9 @@ def make_filter(
         sigma=config.sigma,
         z_hit=config.z_hit,
         max_range=config.max_range,
-        independent_beams=worth,
+        independent_beams=config.independent_beams,
     )
-    recovery = Recovery(readings=min(worth, float(config.num_beams)))
+    recovery = Recovery(readings=min(config.independent_beams, float(config.num_beams)))
     return MonteCarloLocalization(motion, sensor, grid.free_space(), least_ess=config.least_ess, recovery=recovery)
 
 

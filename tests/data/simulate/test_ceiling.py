@@ -56,7 +56,7 @@ def test_the_drive(museum):
 
 
 def test_a_thousand_particles_track_for_two_hundred_meters(museum):  # they end within 10 cm
-    drives = [drive_below(museum, seed, step=0.1) for seed in range(6)]
+    drives = [drive_below(museum, seed, step=0.1) for seed in range(3)]
     drives = jax.tree.map(lambda *leaves: jnp.stack(leaves), *drives)
     filt = localizer(museum, 0.05, 0.05)
 
@@ -66,9 +66,9 @@ def test_a_thousand_particles_track_for_two_hundred_meters(museum):  # R-14: the
         prior = Gaussian(drive.start, jnp.diag(jnp.array([0.01, 0.01, 0.0025])))
         return follow(filt, drive, Particles.from_gaussian(prior, 1000, key=key), key)
 
-    found = errors(track(drives, jax.random.split(jax.random.key(0), 6)), drives)
-    assert found.shape == (6, 2000)
-    assert np.median(found) < 0.06 and np.median(found[:, -1]) < 0.06 and np.sum(found[:, -1] < 0.1) >= 5
+    found = errors(track(drives, jax.random.split(jax.random.key(0), 3)), drives)
+    assert found.shape == (3, 2000)
+    assert np.median(found) < 0.06 and np.median(found[:, -1]) < 0.06 and np.all(found[:, -1] < 0.1)
 
 
 def test_forty_thousand_particles_find_the_robot(museum):  # within 126 updates, from anywhere
