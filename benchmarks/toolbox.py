@@ -280,7 +280,8 @@ def _modes_scores(
         both = (history.states, smooth_modes(bank, history, controls))
         return [jax.vmap(lambda state: state.combined().mean)(states) for states in both]
 
-    found = jax.jit(jax.vmap(paths))(readings)
+    # One run after the other: a bank in a batch takes long to compile.
+    found = jax.jit(lambda readings: jax.lax.map(paths, readings))(readings)
     return {key: _score(error(path)) for key, path in zip((name, "s" + name), found, strict=True)}
 
 

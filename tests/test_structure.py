@@ -153,10 +153,11 @@ def test_readme_commands_are_those_of_the_ci():
 
 
 def test_readme_code_runs(capsys):
-    (code,) = readme_blocks("python")
-    exec(compile(code, "README.md", "exec"), {})
+    names: dict = {}
+    for code in readme_blocks("python"):
+        exec(compile(code, "README.md", "exec"), names)
     printed = capsys.readouterr().out
-    assert printed.startswith("True (1000, 6, 6)") and printed.endswith("(50, 2)\n")
+    assert printed.startswith("True (1000, 6, 6)") and printed.endswith("(50, 2)\nTrue\n")
 
 
 def test_readme_links_lead_somewhere():

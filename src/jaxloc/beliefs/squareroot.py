@@ -213,23 +213,17 @@ def _gram_schmidt(rows: Array) -> Array:
 
 def _gram_schmidt_stacked(stack: Array) -> Array:
     """The same with the batch along the last axis, where it fills vector registers: several times as fast."""
-    size, count = stack.shape[1:]
-    left = [jnp.moveaxis(stack[:, i], 0, -1) for i in range(size)]
+    left = [jnp.moveaxis(stack[:, i], 0, -1) for i in range(stack.shape[1])]
     columns = []
-    for i in range(size):
+    for i in range(stack.shape[1]):
         first, *rest = left
-        length = jnp.sqrt(_dot(first, first, count))
+        length = jnp.sqrt(jnp.sum(first * first, axis=0))
         direction = first / jnp.where(length > 0.0, length, 1.0)[None]
-        parts = [_dot(row, direction, count) for row in rest]
+        parts = [jnp.sum(row * direction, axis=0) for row in rest]
         left = [row - part[None] * direction for row, part in zip(rest, parts, strict=True)]
         columns.append(jnp.stack([jnp.zeros_like(length)] * i + [length, *parts], axis=-1))
     # Without the barrier what comes after is merged with the last of this loop, and works it out again and again.
     return lax.optimization_barrier(jnp.stack(columns, axis=-1))
-
-
-def _dot(a: Array, b: Array, count: int) -> Array:
-    """Sum of products along the first axis, term by term: a reduction there is not vectorized."""
-    return sum((a[j] * b[j] for j in range(1, count)), a[0] * b[0])
 
 
 def _by_library(rows: Array) -> Array:

@@ -70,7 +70,7 @@ def write_map(path: Path | str, grid: OccupancyMap) -> None:
     path = Path(path)
     values = np.full(grid.probability.shape, 205, np.uint8)
     values[np.asarray(grid.occupied)], values[np.asarray(grid.free)] = 0, 254
-    rows, columns = values.shape
+    rows, columns = grid.probability.shape
     image = path.with_suffix(".pgm")
     write_file(image, b"P5\n%d %d\n255\n" % (columns, rows) + values[::-1].tobytes())
     x, y, theta = (float(value) for value in (grid.origin.x, grid.origin.y, grid.origin.theta))

@@ -78,16 +78,16 @@ def draw_map_path(
     Raises:
         ImportError: when matplotlib is not installed.
     """
-    found = np.ones(len(poses), bool) if found is None else found
+    trusted = np.ones(len(poses), bool) if found is None else found
     figure = _new_figure(9.0, 9.0 * _aspect(grid) + 0.6)
     plot = figure.add_subplot()
     _add_map(plot, grid)
     if reference is not None:
         plot.plot(reference[:, 0], reference[:, 1], color=_TRUTH, linewidth=2.6, alpha=0.35, label="reference")
-    path = np.where(found[:, None], poses, np.nan)
+    path = np.where(trusted[:, None], poses, np.nan)
     plot.plot(path[:, 0], path[:, 1], color=_ESTIMATE, linewidth=1.1, label="estimate")
-    if not found.all():
-        plot.plot(*poses[~found, :2].T, ".", color=_CLOUD, markersize=3.0, label="not found yet")
+    if not trusted.all():
+        plot.plot(*poses[~trusted, :2].T, ".", color=_CLOUD, markersize=3.0, label="not found yet")
     plot.legend(frameon=True, framealpha=0.85, fontsize=8, loc="best")
     return figure
 
