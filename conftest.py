@@ -30,6 +30,8 @@ def quick_compiles(request):
     heavy = request.node.get_closest_marker("heavy") is not None
     jax.config.update("jax_disable_most_optimizations", not heavy)
     yield
+    # Each program holds memory maps, of which a process may have 65530: a whole suite of them is too many.
+    jax.clear_caches()
 
 
 @pytest.fixture

@@ -178,8 +178,8 @@ def reentry_means(runs: str) -> dict[str, float]:
     return {key: score.mean for key, score in reentry(int(runs)).items()}
 
 
-def maneuvers(runs: int, seed: int = 0, *, singles: bool = True) -> dict[str, Score]:
-    """Mean squared errors of position when acceleration sets in and ends."""
+def maneuvers(runs: int, seed: int = 0, *, whole: bool = True) -> dict[str, Score]:
+    """Mean squared errors of position when acceleration sets in and ends; of the bank's filter alone unless whole."""
     rng = np.random.default_rng(seed)
     dt, steps = 0.1, 200
     models = (ConstantVelocity(0.01, padding=2), ConstantAcceleration(1.0))
@@ -199,9 +199,9 @@ def maneuvers(runs: int, seed: int = 0, *, singles: bool = True) -> dict[str, Sc
     priors = [Gaussian(mean, 0.1 * jnp.diag(jnp.array([1.0, 1.0, 1.0, 1.0, a, a]))) for a in (0.0, 5.0)]
     error = _squared_errors(jnp.asarray(truth[..., :2], float))
     scores = {}
-    for name, filt, prior in zip(("kf1", "kf2"), filters, priors, strict=True) if singles else ():
+    for name, filt, prior in zip(("kf1", "kf2"), filters, priors, strict=True) if whole else ():
         scores |= _scores({name: filt}, prior, jnp.full(steps, dt), readings, error)
-    return scores | _modes_scores("imm", bank, priors, (0.9, 0.1), jnp.full(steps, dt), readings, error)
+    return scores | _modes_scores("imm", bank, priors, (0.9, 0.1), jnp.full(steps, dt), readings, error, whole)
 
 
 def turns(runs: int, seed: int = 0) -> dict[str, Score]:
@@ -268,7 +268,14 @@ def _scores(
 
 
 def _modes_scores(
-    name: str, bank: Any, priors: list[Gaussian], shares: tuple[float, ...], controls: Any, readings: Any, error: Any
+    name: str,
+    bank: Any,
+    priors: list[Gaussian],
+    shares: tuple[float, ...],
+    controls: Any,
+    readings: Any,
+    error: Any,
+    whole: bool = True,
 ) -> dict[str, Score]:
     states = jax.tree.map(
         lambda *leaves: jnp.stack(leaves), *[filt.init(prior) for filt, prior in zip(bank.filters, priors, strict=True)]
@@ -277,12 +284,12 @@ def _modes_scores(
 
     def paths(reading):
         _, history = run(bank, start, controls, reading, jnp.ones(controls.shape[0], bool))
-        both = (history.states, smooth_modes(bank, history, controls))
+        both = (history.states, smooth_modes(bank, history, controls)) if whole else (history.states,)
         return [jax.vmap(lambda state: state.combined().mean)(states) for states in both]
 
     # One run after the other: a bank in a batch takes long to compile.
     found = jax.jit(lambda readings: jax.lax.map(paths, readings))(readings)
-    return {key: _score(error(path)) for key, path in zip((name, "s" + name), found, strict=True)}
+    return {key: _score(error(path)) for key, path in zip((name, "s" + name), found, strict=False)}
 
 
 def _position_errors(truth: Array) -> Callable[[Array], Array]:

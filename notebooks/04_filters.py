@@ -156,9 +156,8 @@ def simulate_growth(key):
 
 
 times, states, squares = simulate_growth(jax.random.key(0))
-cloud = jl.beliefs.Particles.from_gaussian(
-    jl.beliefs.Gaussian(jnp.zeros(1), 5.0 * jnp.eye(1)), 1000, key=jax.random.key(1)
-)
+belief = jl.beliefs.Gaussian(jnp.zeros(1), 5.0 * jnp.eye(1))
+cloud = jl.beliefs.Particles.from_gaussian(belief, 1000, key=jax.random.key(1))
 everything = jnp.ones(100, bool)
 particles = jl.filters.ParticleFilter(Growth(), Square())
 unscented = jl.filters.SigmaPointFilter(Growth(), Square())
@@ -171,7 +170,7 @@ _, by_particles = jl.filters.run(
     keep=lambda state: state.particles.mean(),
     key=jax.random.key(2),
 )
-_, by_points = jl.filters.run(unscented, unscented.init(guess), times, squares, everything)
+_, by_points = jl.filters.run(unscented, unscented.init(belief), times, squares, everything)
 for name, mean in (("particles", by_particles.states), ("unscented", by_points.states.mean)):
     print(f"{name:<10} mean square error {float(jnp.mean((mean - states) ** 2)):.1f}")
 
@@ -181,9 +180,7 @@ for name, mean in (("particles", by_particles.states), ("unscented", by_points.s
 
 # %%
 many = 10_000 if FAST else 1_000_000
-cloud = jl.beliefs.Particles.from_gaussian(
-    jl.beliefs.Gaussian(jnp.zeros(1), 5.0 * jnp.eye(1)), many, key=jax.random.key(1)
-)
+cloud = jl.beliefs.Particles.from_gaussian(belief, many, key=jax.random.key(1))
 _, history = jl.filters.run(
     particles,
     particles.init(cloud),

@@ -38,7 +38,7 @@ class GaussianState(FilterState):
     step: Int[Array, ""]
 
     @property
-    def covariance(self) -> Float[Array, "d d"]:
+    def covariance(self) -> Float[Array, "*s d d"]:
         """Of the tangent at the mean; symmetric and never negative, being a product of the root with itself."""
         return matmul(self.covariance_sqrt, self.covariance_sqrt.mT)
 

@@ -84,13 +84,15 @@ def run_parallel(
         steps = _linearize(filt, path, controls, measurements, valid, there)
         return steps, prior, filter_blocks(steps, prior, num_blocks)
 
-    def again(_, path):
-        steps, prior, (filtered, _) = linearized(path)
-        return _straighten(path, _tangent_smoothed(steps, prior, filtered, num_blocks))
+    def again(path, _):
+        steps, prior, found = linearized(path)
+        return _straighten(path, _tangent_smoothed(steps, prior, found[0], num_blocks)), (path, found)
 
     if iterations > 1:
-        path = lax.fori_loop(0, iterations - 1, again, path)
-    filtered, infos = linearized(path)[2]
+        _, passes = lax.scan(again, path, length=iterations)
+        path, (filtered, infos) = jax.tree.map(lambda leaf: leaf[-1], passes)
+    else:
+        filtered, infos = linearized(path)[2]
     numbers = state.step + jnp.cumsum(there, dtype=state.step.dtype)
     states = jax.vmap(_state)(jax.tree.map(lambda leaf: leaf[1:], path), filtered, numbers)
     return jax.tree.map(lambda leaf: leaf[-1], states), History(states, infos)
