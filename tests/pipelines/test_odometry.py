@@ -9,6 +9,8 @@ from jaxloc.data import kitti, simulate_street
 from jaxloc.pipelines import odometry
 from jaxloc.slam import MatchingOptions
 
+pytestmark = pytest.mark.heavy
+
 
 def matrices(steps):
     return np.stack([np.asarray(step.pose.matrix(), np.float64) for step in steps])

@@ -12,6 +12,8 @@ from jaxloc.poses import SE3
 from jaxloc.refinement import StereoMatches
 from jaxloc.slam import estimate_disparity_offset, estimate_motion
 
+pytestmark = pytest.mark.heavy
+
 NOISE = 0.5
 
 
