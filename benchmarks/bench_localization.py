@@ -11,9 +11,9 @@ from scipy import ndimage
 
 import jaxloc as jl
 from benchmarks.metric import ACCURACY, REPOSITORY, TIME, Metric, quickest, timed, versus
-from jaxloc.data.planar import relative_poses
 from jaxloc.filters import MonteCarloLocalization, Recovery
 from jaxloc.poses import SE2
+from jaxloc.poses.planar import relative_poses
 from jaxloc.sensors import BeamModel, DistanceField, LaserScan, LikelihoodField, OccupancyMap, OdometryMotion
 
 _BUILDING = REPOSITORY.parent / "shared" / "data" / "mcl_fr079"

@@ -6,9 +6,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter as Peer
+from scipy.stats import chi2
 
 from jaxloc.beliefs import Gaussian
-from jaxloc.filters import ConstantVelocity, GaussianState, KalmanFilter, LinearMotion, LinearSensor, kalman, run
+from jaxloc.filters import (
+    ConstantVelocity,
+    GaussianState,
+    KalmanFilter,
+    LinearMotion,
+    LinearSensor,
+    SigmaPointFilter,
+    kalman,
+    run,
+)
 from jaxloc.poses import SE2, local, retract
 
 STEPS = 17
@@ -224,3 +234,45 @@ def test_recenter_carries_a_pose_covariance(x64):
     found = carried @ carried.T
     assert np.allclose(np.cov(np.asarray(images).T), found, atol=0.1 * float(found.max()))
     assert isinstance(GaussianState(moved, carried, jnp.zeros((), jnp.int32)).gaussian(), Gaussian)
+
+
+# T-56, T-90: means over 200 runs of chi-square values, in float32 as it ships
+def test_consistent_over_runs():
+    runs, steps, dt = 200, 25, jnp.array(0.5)
+    motion, sensor = ConstantVelocity(0.3), LinearSensor(jnp.eye(2, 4), 0.2 * jnp.eye(2))
+    filt, prior = KalmanFilter(motion, sensor), Gaussian(jnp.zeros(4), jnp.diag(jnp.array([1.0, 1.0, 0.5, 0.5])))
+
+    def one(key):
+        first, second = jax.random.split(key)
+
+        def advance(state, key):
+            keys = jax.random.split(key)
+            state = motion.sample(state, dt, key=keys[0])
+            return state, (state, state[:2] + jnp.sqrt(0.2) * jax.random.normal(keys[1], (2,)))
+
+        truth, readings = jax.lax.scan(advance, prior.sample(1, key=first)[0], jax.random.split(second, steps))[1]
+        _, history = run(filt, filt.init(prior), jnp.full(steps, dt), readings, jnp.ones(steps, bool))
+        nees = jax.vmap(lambda state, x: state.gaussian().mahalanobis_squared(x))(history.states, truth)
+        return nees, history.infos.nis
+
+    nees, nis = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(4), runs))
+    for values, dof in ((nees, 4), (nis, 2)):
+        low, high = (chi2.ppf(p, dof * runs) / runs for p in (0.025, 0.975))
+        means = np.asarray(values).mean(axis=0)
+        assert np.mean((means > low) & (means < high)) >= 0.8
+        assert low < means.mean() < high
+
+
+@pytest.mark.parametrize("kind", [KalmanFilter, SigmaPointFilter])
+def test_a_gate_keeps_wild_readings_out(kind):
+    eye = jnp.eye(2)
+    filt = kind(LinearMotion(eye, eye), LinearSensor(eye, eye), gate=0.99)
+    state = filt.init(Gaussian(jnp.zeros(2), eye))
+    # Variance 2 in each direction: the 99 % region of two of them ends at 9.21.
+    for length, passes in ((4.2, True), (4.4, False)):
+        after, info = filt.update(state, jnp.array([length, 0.0]), jnp.array(True))
+        np.testing.assert_allclose(info.nis, length**2 / 2, rtol=1e-5)
+        assert bool(info.accepted) is passes and bool(info.ok)
+        assert bool(info.log_likelihood != 0.0) is passes
+        np.testing.assert_allclose(after.mean, [length / 2 * passes, 0.0], atol=1e-5)
+        np.testing.assert_allclose(after.covariance, (0.5 if passes else 1.0) * np.eye(2), atol=1e-5)

@@ -8,10 +8,10 @@ import pytest
 
 from jaxloc.beliefs import Gaussian, KLDSize, Particles, Sensor
 from jaxloc.data import carmen, maps, simulate_laser_drive
-from jaxloc.data.planar import relative_poses
 from jaxloc.filters import MonteCarloLocalization, Recovery, run
 from jaxloc.filters.localization import find_place
 from jaxloc.poses import SE2
+from jaxloc.poses.planar import relative_poses
 from jaxloc.sensors import DistanceField, LaserScan, LikelihoodField, OdometryMotion
 
 STEPS, PARTICLES = 40, 10_000

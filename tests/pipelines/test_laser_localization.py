@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from jaxloc.data import simulate_laser_drive
-from jaxloc.data.planar import relative_poses
 from jaxloc.pipelines import laser_localization
 from jaxloc.pipelines.laser_localization import Config
 from jaxloc.poses import SE2
+from jaxloc.poses.planar import relative_poses
 from jaxloc.sensors import OccupancyMap
 
 CONFIG = Config(num_particles=1000, num_particles_global=10_000)

@@ -1,6 +1,5 @@
 """``jaxloc localize``: run the filter, write a row a scan as they come, then metrics and report."""
 
-import json
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -8,10 +7,9 @@ from typing import Any
 import numpy as np
 import typer
 
-import jaxloc
-from jaxloc.cli import configuration, localize_summary, session, summary
+from jaxloc.cli import configuration, localize_summary, results, session
 from jaxloc.data import DataError, LaserLog, carmen, maps, tum
-from jaxloc.data.writing import RowWriter, write_file
+from jaxloc.data.writing import RowWriter
 from jaxloc.poses import SE2
 from jaxloc.sensors import OccupancyMap
 
@@ -43,7 +41,7 @@ def run_log(
         DataError: when any input is bad; nothing is written then.
     """
     session.check_output(out)
-    summary.check_extras()
+    results.check_extras()
     configuration.load_yaml()
     session.keep_compilations()
     if start is not None and not np.isfinite(start).all():
@@ -66,7 +64,7 @@ def run_log(
     with session.Interruption() as interruption, session.output_folder(out):
         _stream(log, grid, start, config, out, record, interruption)
         record.interrupted = interruption.requested
-        metrics = _write_results(record, config, out, inputs)
+        metrics = results.write(record, config, out, inputs)
     _announce(metrics, out)
     return 130 if record.interrupted else 0
 
@@ -136,16 +134,6 @@ def _spread_row(step: Any) -> str:
     sigmas = np.sqrt(np.maximum([covariance[0, 0], covariance[1, 1], step.covariance[2, 2]], 0.0))
     numbers = [f"{step.time:.6f}", *(f"{sigma:.6g}" for sigma in sigmas), f"{step.mass:.4f}", f"{step.ess:.1f}"]
     return ",".join([*numbers, f"{step.num_particles}", f"{step.inject:.4f}", f"{step.updated:d}", f"{step.found:d}"])
-
-
-def _write_results(record: localize_summary.Record, config: Any, out: Path, inputs: dict[str, Any]) -> dict[str, Any]:
-    yaml = configuration.load_yaml()
-    settings = {"jaxloc": jaxloc.__version__, **inputs, "config": configuration.to_plain(config)}
-    write_file(out / "config.yaml", yaml.safe_dump(settings, sort_keys=False))
-    metrics = record.metrics()
-    write_file(out / "metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n")
-    write_file(out / "report.html", record.page(metrics))
-    return metrics
 
 
 def _announce(metrics: dict[str, Any], out: Path) -> None:

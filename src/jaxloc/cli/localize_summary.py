@@ -6,10 +6,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float64, Int
 
-from jaxloc.cli.summary import _finite, _table
+from jaxloc.cli import results
 from jaxloc.data import LaserLog
-from jaxloc.data.planar import relative_poses
 from jaxloc.evaluation import plot_map, report
+from jaxloc.poses.planar import relative_poses
 from jaxloc.sensors import OccupancyMap
 
 _SAME_TIME = 0.02  # stamps of one instant, s
@@ -90,7 +90,7 @@ class Record:
         }
         if self.reference is not None:
             numbers |= self._accuracy(found)
-        return _finite(numbers)
+        return results.finite(numbers)
 
     def errors(self) -> tuple[np.ndarray, np.ndarray]:
         """Which scans can be compared, and (x, y, heading) of the reference from the estimate there."""
@@ -129,7 +129,7 @@ class Record:
         )
         sections.append(report.Section("Particles", text, clouds, raster=True))
         sections += self._error_section() + self._confidence_sections()
-        sections.append(report.Section("Numbers", "SI units, or the unit in the name.", table=_table(metrics)))
+        sections.append(report.Section("Numbers", "SI units, or the unit in the name.", table=results.table(metrics)))
         summary = f"{metrics['scans']} scans, {metrics['scans_used']} used."
         if self.interrupted:
             summary += " Interrupted: the report ends with the last scan that was processed."

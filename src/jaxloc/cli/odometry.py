@@ -1,6 +1,5 @@
 """``jaxloc odometry`` and ``jaxloc demo``: run the pipeline, write its rows as they come, then metrics and report."""
 
-import json
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -9,10 +8,9 @@ from typing import Any
 import numpy as np
 import typer
 
-import jaxloc
-from jaxloc.cli import configuration, session, summary
+from jaxloc.cli import configuration, odometry_summary, results, session
 from jaxloc.data import DataError, StereoFrame, StereoSequence, covariance, kitti, simulate_street, tum
-from jaxloc.data.writing import RowWriter, write_file
+from jaxloc.data.writing import RowWriter
 
 
 def run_recording(folder: Path, poses: Path | None, out: Path, config_path: Path | None) -> int:
@@ -62,7 +60,7 @@ def run_demo(out: Path, config_path: Path | None, *, num_frames: int, seed: int)
 def _prepare(out: Path, config_path: Path | None) -> Any:
     """Checks all that can fail before the run: the output folder, the options, the libraries for the report."""
     session.check_output(out)
-    summary.check_extras()
+    results.check_extras()
     configuration.load_yaml()
     session.keep_compilations()
     from jaxloc.pipelines import odometry
@@ -72,17 +70,21 @@ def _prepare(out: Path, config_path: Path | None) -> Any:
 
 
 def _run(sequence: StereoSequence, config: Any, out: Path, inputs: dict[str, Any], *, title: str) -> int:
-    record = summary.Record(title, sequence)
+    record = odometry_summary.Record(title, sequence)
     with session.Interruption() as interruption, session.output_folder(out):
         _stream(sequence, config, out, record, interruption)
         record.interrupted = interruption.requested
-        metrics = _write_results(record, config, out, inputs)
+        metrics = results.write(record, config, out, inputs)
     _announce(metrics, out)
     return 130 if record.interrupted else 0
 
 
 def _stream(
-    sequence: StereoSequence, config: Any, out: Path, record: summary.Record, interruption: session.Interruption
+    sequence: StereoSequence,
+    config: Any,
+    out: Path,
+    record: odometry_summary.Record,
+    interruption: session.Interruption,
 ) -> None:
     """Writes a row of every file for each frame, until the end or an interrupt."""
     from jaxloc.pipelines import odometry
@@ -112,16 +114,6 @@ def _until(sequence: StereoSequence, interruption: session.Interruption) -> Iter
         if interruption.requested:
             return
         yield frame
-
-
-def _write_results(record: summary.Record, config: Any, out: Path, inputs: dict[str, Any]) -> dict[str, Any]:
-    yaml = configuration.load_yaml()
-    settings = {"jaxloc": jaxloc.__version__, **inputs, "config": configuration.to_plain(config)}
-    write_file(out / "config.yaml", yaml.safe_dump(settings, sort_keys=False))
-    metrics = record.metrics()
-    write_file(out / "metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n")
-    write_file(out / "report.html", record.page(metrics))
-    return metrics
 
 
 def _announce(metrics: dict[str, Any], out: Path) -> None:

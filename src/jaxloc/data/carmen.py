@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from jaxloc.data.laser_log import LaserLog
-from jaxloc.data.planar import relative_poses
 from jaxloc.data.sequence import DataError
+from jaxloc.poses.planar import relative_poses
 
 _LONGEST_LINE = 1 << 20
 _LARGEST_LOG = 1 << 31  # bytes after decompression

@@ -15,10 +15,10 @@ import numpy as np
 
 from jaxloc.data.carmen import increasing, read_lines
 from jaxloc.data.laser_log import LaserLog
-from jaxloc.data.planar import relative_poses
 from jaxloc.data.sequence import DataError
 from jaxloc.data.tables import parse_numbers
 from jaxloc.poses import SE2
+from jaxloc.poses.planar import relative_poses
 from jaxloc.sensors import OccupancyMap
 
 _CELL = 0.1

@@ -200,8 +200,7 @@ class MonteCarloLocalization(Filter):
         normal = jax.random.normal(key_move, shape, particles.log_weights.dtype)
         values = jax.vmap(lambda pose, n: self.motion.perturb(pose, control, n))(particles.values, normal)
         particles = Particles(values, particles.log_weights, particles.valid)
-        # Without this cast of the dice a step is much cheaper, and steps of a robot that knows its place are without
-        # it.
+        # Drawing random poses is dear, and a robot that knows its place needs none.
         particles = lax.cond(
             state.inject > 0, lambda: self._inject(particles, state.inject, key_inject), lambda: particles
         )

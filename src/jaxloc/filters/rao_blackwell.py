@@ -20,10 +20,10 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from jaxloc.beliefs import Gaussian, Motion, gate, resampling
+from jaxloc.beliefs import Gaussian, Motion, Particles, gate, resampling
 from jaxloc.beliefs.squareroot import cholesky, solve, whiten
 from jaxloc.filters.contract import Filter, FilterState, Info
-from jaxloc.poses import SE2, local, retract
+from jaxloc.poses import SE2, retract
 from jaxloc.poses.group import as_floats, matmul
 from jaxloc.sensors.landmarks import RangeBearing, locate, locate_covariance, observe, polar_jacobian, sanitize
 
@@ -69,14 +69,9 @@ class FastSlamState(FilterState):
 
     def gaussian(self) -> Gaussian:
         """The pose as a density: mean and spread of the particles."""
-        weights = jnp.exp(self.log_weights)
-        center = jax.tree.map(lambda leaf: leaf[self.best()], self.poses)
-        for _ in range(2):
-            deviations = jax.vmap(lambda pose, start=center: local(start, pose))(self.poses)
-            center = retract(center, matmul(weights, deviations))
-        deviations = jax.vmap(lambda pose: local(center, pose))(self.poses)
-        within = jnp.sum(weights[:, None, None] * self.pending, axis=0)
-        return Gaussian(center, matmul(deviations.T, weights[:, None] * deviations) + within)
+        cloud = Particles(self.poses, self.log_weights)
+        spread = cloud.gaussian()
+        return Gaussian(spread.mean, spread.covariance + jnp.sum(cloud.weights[:, None, None] * self.pending, axis=0))
 
     def landmarks(self) -> Float[Array, "k 2"]:
         """The map of the best particle, m."""
@@ -210,7 +205,7 @@ class FastSlam(Filter):
         if key is None:
             raise ValueError("FastSlam.update draws particles: pass key=jax.random.key(...), as to run(..., key=key).")
         key_draw, key_resample = jax.random.split(key)
-        reading, usable = sanitize(measurement, valid)
+        reading, usable = sanitize(measurement, valid & (measurement.landmark < self.capacity))
         normal = jax.random.normal(key_draw, (self.num_particles, 3), state.pending.dtype)
         poses, maps, gains = jax.vmap(self._explain, in_axes=(0, 0, 0, None, 0))(
             state.poses, state.pending, state.maps, reading, normal
@@ -219,7 +214,7 @@ class FastSlam(Filter):
         total = logsumexp(joint)
         fine = jnp.isfinite(total)
         weights = jnp.where(fine, joint - jnp.where(fine, total, 0.0), state.log_weights)
-        ess = 1.0 / jnp.sum(jnp.exp(2.0 * weights))
+        ess = Particles(state.poses, weights).ess
         resampled = usable & fine & (ess < self.ess_threshold * self.num_particles)
         own = jnp.arange(self.num_particles, dtype=jnp.int32)
         drawn = resampling.systematic(key_resample, weights, self.num_particles).astype(jnp.int32)

@@ -19,6 +19,7 @@ from jaxloc.beliefs.resampling import systematic
 from jaxloc.filters import MonteCarloLocalization, Recovery, run
 from jaxloc.filters.localization import LocalizationState
 from jaxloc.poses import SE2
+from jaxloc.poses.planar import compose_poses, relative_poses
 from jaxloc.sensors import DistanceField, LaserScan, LikelihoodField, OccupancyMap, OdometryMotion
 
 _CLOUD = 600  # particles of a step that are kept for pictures
@@ -260,7 +261,7 @@ def _advance(
     padded = np.concatenate([chunk, np.full(size - len(chunk), chunk[-1])])
     place = np.searchsorted(used, padded)
     before = used[np.maximum(place - 1, 0)]
-    motions = _relative(log.odometry[before], log.odometry[padded]).astype(np.float32)
+    motions = relative_poses(log.odometry[before], log.odometry[padded]).astype(np.float32)
     controls = jax.vmap(SE2)(*jnp.asarray(motions).T)
     scans = LaserScan(jnp.asarray(log.ranges[padded]), log.angle_min, log.angle_increment).thin(config.num_beams)
     valid = _below_limit(scans.ranges, float(log.max_range))
@@ -272,13 +273,6 @@ def _advance(
 @eqx.filter_jit
 def _below_limit(ranges: Float[Array, "t b"], limit: float) -> Bool[Array, "t b"]:
     return ranges < 0.999 * limit
-
-
-def _relative(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    shift = after[:, :2] - before[:, :2]
-    cos, sin = np.cos(before[:, 2]), np.sin(before[:, 2])
-    turn = (after[:, 2] - before[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
-    return np.stack([cos * shift[:, 0] + sin * shift[:, 1], cos * shift[:, 1] - sin * shift[:, 0], turn], axis=1)
 
 
 def _is_sure(history: Any, place: int, config: Config) -> bool:
@@ -322,11 +316,9 @@ def _step(history: Any, place: int, index: int, log: Any, found: bool, size: int
 
 def _carried(last: Step, log: Any, index: int) -> Step:
     """A scan that was not used: odometry carries the pose on."""
-    moved = _relative(log.odometry[last.index][None], log.odometry[index][None])[0]
-    x, y, heading = last.pose
-    cos, sin = np.cos(heading), np.sin(heading)
-    turned = (heading + moved[2] + np.pi) % (2.0 * np.pi) - np.pi
-    pose = np.array([x + cos * moved[0] - sin * moved[1], y + sin * moved[0] + cos * moved[1], turned])
+    moved = relative_poses(log.odometry[last.index][None], log.odometry[index][None])[0]
+    pose = compose_poses(last.pose[None], moved[None])[0]
+    pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
     return Step(
         index=index,
         time=float(log.times[index]),

@@ -1,6 +1,6 @@
 """Where things are: rotations, poses, and moving any pytree along a tangent."""
 
-from jaxloc.poses import compound, manifold, rotation, se2, se3, series, trajectory
+from jaxloc.poses import compound, manifold, planar, rotation, se2, se3, series, trajectory
 from jaxloc.poses.group import Group
 from jaxloc.poses.manifold import local, retract, tangent_dimension, tangent_labels
 from jaxloc.poses.rotation import SO2, SO3, wrap_angle
@@ -20,6 +20,7 @@ __all__ = [
     "interpolate",
     "local",
     "manifold",
+    "planar",
     "retract",
     "rotation",
     "se2",

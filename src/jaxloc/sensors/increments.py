@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxloc.beliefs import Motion
 from jaxloc.poses import SE2
 from jaxloc.poses.group import as_floats
+from jaxloc.sensors.landmarks import length
 
 
 class Increment(eqx.Module):
@@ -77,7 +78,7 @@ class IncrementMotion(Motion):
     def covariance(self, state: SE2, control: Increment) -> Float[Array, "3 3"]:
         """Of (along, aside, heading) in the frame after the step."""
         del state
-        way, turn = _magnitude(control.motion.translation), jnp.abs(control.motion.theta)
+        way, turn = length(control.motion.translation), jnp.abs(control.motion.theta)
         along = self.drive**2 * way + self.idle**2 * control.dt
         aside = self.side**2 * way + self.idle**2 * control.dt
         heading = self.turn_drive**2 * way + self.turn_turn**2 * turn + self.turn_idle**2 * control.dt
@@ -86,9 +87,3 @@ class IncrementMotion(Motion):
     def linearize(self, state: SE2, control: Increment) -> tuple[SE2, Float[Array, "3 3"]]:
         """The moved pose and the adjoint of the way back."""
         return self.move(state, control), control.motion.inverse().adjoint()
-
-
-def _magnitude(vector: Float[Array, "2"]) -> Float[Array, ""]:
-    squared = jnp.sum(vector**2)
-    zero = squared <= 0.0
-    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxloc.beliefs import Gaussian, Motion, gate
 from jaxloc.beliefs.conditional import innovation, mask_covariance
 from jaxloc.beliefs.squareroot import cholesky, solve, whiten
-from jaxloc.filters import Filter, FilterState, GaussianInfo
+from jaxloc.filters import Filter, FilterState, Info
 from jaxloc.poses import SE2
 from jaxloc.poses.group import as_floats, matmul
 from jaxloc.sensors.landmarks import RangeBearing, locate, locate_covariance, observe, polar_jacobian, sanitize
@@ -67,14 +67,28 @@ class SlamState(FilterState):
         return Gaussian(point, jnp.where(self.seen[index], covariance, unknown))
 
 
-class SlamInfo(GaussianInfo):
-    """What an update of `EkfSlam` says, beyond a `GaussianInfo`.
+class SlamInfo(Info):
+    """What an update of `EkfSlam` says: a `GaussianInfo`, and what became of the reading.
 
     Attributes:
+        log_likelihood: of the reading given all earlier ones; zero where it changed nothing.
+        ok: whether the state can be used.
+        innovation: (range, bearing) measured minus expected, zero where there was nothing to expect.
+        innovation_covariance: its predicted covariance.
+        nis: normalized innovation squared, also of a reading that was refused.
+        dof: 2, or 0 where the landmark was not in the map.
+        accepted: whether it passed the gate.
         landmark: the row of the map that the reading was taken for.
         added: whether it entered the map.
     """
 
+    log_likelihood: Float[Array, ""]
+    ok: Bool[Array, ""]
+    innovation: Float[Array, "2"]
+    innovation_covariance: Float[Array, "2 2"]
+    nis: Float[Array, ""]
+    dof: Int[Array, ""]
+    accepted: Bool[Array, ""]
     landmark: Int[Array, ""]
     added: Bool[Array, ""]
 
@@ -151,7 +165,7 @@ class EkfSlam(Filter):
     ) -> tuple[SlamState, SlamInfo]:
         """One reading: its landmark and the pose are corrected, or the landmark enters the map."""
         del key
-        reading, usable = sanitize(measurement, valid)
+        reading, usable = sanitize(measurement, valid & (measurement.landmark < self.capacity))
         index, nis, fresh = self._associate(state, reading)
         near = gate(nis, 2, self.probability) & ~fresh
         distrusted = ~near & ~fresh & (state.support[index] <= 0)
@@ -229,7 +243,8 @@ class EkfSlam(Filter):
         return index, squared[within], jnp.where(numbered, ~state.seen[within], unlike)
 
 
-def _inform(residual, spread, known, near, index, adds) -> SlamInfo:
+def _inform(residual: Array, spread: Array, known: Array, near: Array, index: Array, adds: Array) -> SlamInfo:
+    """What a reading says; one that is refused, or of a new landmark, counts nothing in the likelihood."""
     mask = jnp.broadcast_to(known, (2,))
     spread = mask_covariance(spread, mask)
     root = cholesky(spread)
@@ -237,7 +252,8 @@ def _inform(residual, spread, known, near, index, adds) -> SlamInfo:
     nis = jnp.sum(whiten(root, residual) ** 2)
     volume = jnp.sum(jnp.log(jnp.diagonal(root))) + math.log(2.0 * math.pi) * known.astype(nis.dtype)
     accepted, dof = near | ~known, 2 * known.astype(jnp.int32)
-    return SlamInfo(-0.5 * nis - volume, accepted, residual, spread, nis, dof, accepted, index, adds)
+    likelihood = jnp.where(near & known, -0.5 * nis - volume, 0.0)
+    return SlamInfo(likelihood, accepted, residual, spread, nis, dof, accepted, index, adds)
 
 
 def _blocks(jacobian: Float[Array, "2 2"]) -> tuple[Float[Array, "2 3"], Float[Array, "2 2"]]:

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxloc.data.planar import relative_poses
 from jaxloc.data.simulate.laser import cast_rays, make_building, simulate_laser_drive
+from jaxloc.poses.planar import relative_poses
 
 
 def test_rays_end_where_a_march_ends(rng):

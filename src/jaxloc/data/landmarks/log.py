@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64
 
-from jaxloc.data.planar import relative_poses
 from jaxloc.poses import SE2, SO2
+from jaxloc.poses.planar import relative_poses
 from jaxloc.sensors import Increment, Range, RangeBearing
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxloc.data.landmarks.log import LandmarkLog, assemble, ranges
-from jaxloc.data.planar import interpolate_poses
 from jaxloc.data.sequence import DataError
 from jaxloc.data.tables import check_increasing, read_rows
+from jaxloc.poses.planar import interpolate_poses
 
 _UNRELATED_TRUTH = 1.0  # s without truth beyond which interpolating it means nothing
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxloc.data.laser_log import LaserLog
-from jaxloc.data.planar import compose_poses, relative_poses
 from jaxloc.poses import SE2
+from jaxloc.poses.planar import compose_poses, relative_poses
 from jaxloc.sensors import OccupancyMap
 
 _WALL, _DOOR, _CORRIDOR = 0.15, 1.0, 2.2

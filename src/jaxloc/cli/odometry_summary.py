@@ -1,6 +1,5 @@
 """What a run of the odometry says of itself: numbers for metrics.json and the page of the report."""
 
-import math
 from typing import Any
 
 import equinox as eqx
@@ -8,26 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxloc.cli import results
 from jaxloc.data import StereoSequence
 from jaxloc.evaluation import consistency, drift, plot, report, trajectories
 from jaxloc.evaluation.alignments import NoAlignment
 from jaxloc.poses import Trajectory
 
 _PROBABILITIES = (0.5, 0.9, 0.95)
-
-
-def check_extras() -> None:
-    """Checks that the libraries of the report are there.
-
-    Raises:
-        ImportError: when one is not, with what to do.
-    """
-    try:
-        import jinja2  # noqa: F401
-        import matplotlib.figure  # noqa: F401
-        import rich  # noqa: F401
-    except ImportError as error:
-        raise ImportError(f'reports need {error.name}: pip install "jaxloc[cli]"') from error
 
 
 class Record:
@@ -107,7 +93,7 @@ class Record:
         truth = self.truth()
         if truth is not None and len(truth) > 1:
             numbers |= self._accuracy(truth)
-        return _finite(numbers)
+        return results.finite(numbers)
 
     def _accuracy(self, truth: Trajectory) -> dict[str, Any]:
         lengths = drift.fitting_lengths(float(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1).sum()))
@@ -144,7 +130,7 @@ class Record:
         if self.stages():
             text = "Time of each stage; the first two frames, which compile, are left out."
             sections.append(report.Section("Timings", text, plot.draw_timings(self.stages())))
-        sections.append(report.Section("Numbers", table=_table(metrics)))
+        sections.append(report.Section("Numbers", table=results.table(metrics)))
         note = "Interrupted: the report covers the frames until then. " if self.interrupted else ""
         summary = f"{note}{metrics['frames']} frames, {metrics['distance_m']:.1f} m."
         return report.render_report(self.title, sections, summary=summary, highlights=_highlights(metrics))
@@ -206,27 +192,6 @@ def _compare(
         "motion_nees_mean": trajectories.Errors(squared.values, squared.ok).mean(),
         "motion_coverage": consistency.coverage(squared, 6, probabilities=_PROBABILITIES),
     }
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no infinity and no NaN: null stands for them."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _table(metrics: dict[str, Any]) -> report.Table:
-    rows = []
-    for name, value in metrics.items():
-        parts = value.items() if isinstance(value, dict) else [("", value)]
-        rows += [(f"{name} {part}".strip(), _format(number)) for part, number in parts]
-    return report.Table(("metric", "value"), tuple(rows))
-
-
-def _format(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(_format(item) for item in value)
-    return f"{value:.4g}" if isinstance(value, float) and value < 1e4 else str(value)
 
 
 def _highlights(metrics: dict[str, Any]) -> tuple[report.Highlight, ...]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxloc.data.planar import compose_poses, dead_reckon, interpolate_poses, relative_poses
+from jaxloc.poses.planar import compose_poses, dead_reckon, interpolate_poses, relative_poses
 
 
 def test_motions_lead_from_pose_to_pose(rng):
