@@ -139,7 +139,8 @@ def test_bad_readings_change_nothing(dtype):
     filt = fast(num_particles=20, capacity=2)
     state, _ = filt.update(filt.init(start()), reading(2.0, 0.3, 0), jnp.array(True), key=jax.random.key(0))
     bad_readings = ((reading(jnp.nan, 0.3, 1), True), (reading(2.0, jnp.inf, 1), True), (reading(5.0, 1.0, 1), False))
-    for bad, valid in bad_readings:
+    beyond = (reading(5.0, 1.0, 2), True)  # the map has room for numbers 0 and 1
+    for bad, valid in (*bad_readings, beyond):
         after, info = filt.update(state, bad, jnp.array(valid), key=jax.random.key(1))
         assert all(jax.tree.leaves(jax.tree.map(lambda a, b: bool((a == b).all()), after, state)))
         assert float(info.log_likelihood) == 0.0 and bool(info.ok)

@@ -182,6 +182,7 @@ def test_an_outlier_is_refused_and_a_false_first_reading_is_forgotten(x64):
     state, _ = filt.update(state, reading(2.0, 0.0, 0), jnp.array(True))
     kept, info = filt.update(state, reading(8.0, 2.0, 0), jnp.array(True))
     assert not bool(info.accepted) and int(kept.support[0]) == 1
+    assert float(info.log_likelihood) == 0.0 and float(info.nis) > 100.0
     np.testing.assert_allclose(kept.landmarks, state.landmarks)
     for _ in range(2):
         kept, info = filt.update(kept, reading(8.0, 2.0, 0), jnp.array(True))
@@ -195,6 +196,14 @@ def test_a_full_map_takes_no_more(x64):
     after, info = filt.update(state, reading(9.0, 2.0, -1), jnp.array(True))
     assert not bool(info.added) and bool(info.ok)
     np.testing.assert_allclose(after.landmarks, state.landmarks)
+
+
+def test_a_number_beyond_the_map_is_no_reading(x64):
+    filt = slam(2)
+    state, _ = filt.update(filt.init(start(0.01)), reading(2.0, 0.0, 1), jnp.array(True))
+    after, info = filt.update(state, reading(2.1, 0.0, 2), jnp.array(True))
+    np.testing.assert_array_equal(after.landmarks, state.landmarks)
+    assert not bool(info.added) and float(info.log_likelihood) == 0.0
 
 
 def test_likelihood_has_exact_gradients(x64):
