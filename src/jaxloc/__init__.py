@@ -22,6 +22,7 @@ _ROOMS = (
     "sensors",
     "slam",
     "solvers",
+    "tracking",
 )
 
 __all__ = [*_ROOMS, "__version__"]
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
         sensors,
         slam,
         solvers,
+        tracking,
     )
 
 

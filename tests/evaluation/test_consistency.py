@@ -1,10 +1,10 @@
-"""T-56: NEES and NIS, their bounds and coverage, against scipy's chi-square distribution."""
+"""T-56, T-90: NEES and NIS, their bounds, coverage and distribution, against scipy's chi-square distribution."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, kstest
 
 from jaxloc.evaluation import consistency
 from jaxloc.poses import SE3, Trajectory
@@ -82,3 +82,24 @@ def test_values_that_are_not_ok_do_not_count():
     np.testing.assert_allclose(consistency.coverage(values, 2, probabilities=(0.5,)), [0.5])
     none = consistency.SquaredErrors(jnp.zeros(3), jnp.zeros(3, bool))
     np.testing.assert_allclose(consistency.coverage(none, 2), np.zeros(3))
+
+
+def test_the_distribution_of_squared_errors_is_scipys(rng, dtype):
+    values = chi2.rvs(3, size=400, random_state=rng).astype(dtype)
+    ok = rng.uniform(size=400) < 0.9
+    fit = consistency.calibration(consistency.SquaredErrors(jnp.asarray(values), jnp.asarray(ok)), 3)
+    tolerance = 1e-4 if dtype == np.float32 else 1e-9
+    assert fit.distance.dtype == dtype and int(fit.count) == ok.sum()
+    assert float(fit.distance) == pytest.approx(kstest(values[ok], chi2(3).cdf).statistic, abs=tolerance)
+    counts, _ = np.histogram(values[ok], np.asarray(fit.edges))
+    width = chi2.ppf(0.999, 3) / 20
+    np.testing.assert_allclose(fit.density, counts / (ok.sum() * width), rtol=1e-3, atol=tolerance)
+    np.testing.assert_allclose(fit.expected, np.diff(chi2.cdf(fit.edges, 3)) / width, atol=10 * tolerance)
+    np.testing.assert_allclose(fit.coverage, [np.mean(values[ok] <= chi2.ppf(p, 3)) for p in (0.5, 0.9, 0.95)])
+    proud = consistency.calibration(consistency.SquaredErrors(jnp.asarray(4.0 * values), jnp.asarray(ok)), 3)
+    assert float(proud.distance) > 0.4 > 0.1 > float(fit.distance)
+
+
+def test_a_distribution_of_nothing():
+    fit = consistency.calibration(consistency.SquaredErrors(jnp.zeros(3), jnp.zeros(3, bool)), 3, num_bins=4)
+    assert float(fit.distance) == 1.0 and int(fit.count) == 0 and fit.density.tolist() == [0.0] * 4

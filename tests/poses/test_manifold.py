@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxloc.poses import SE2, SE3, SO2, SO3, local, retract, tangent_dimension, tangent_labels
+from jaxloc.poses import SE2, SE3, SO2, SO3, carry, is_flat, local, retract, tangent_dimension, tangent_labels
 
 
 def nested(dtype):
@@ -84,3 +84,14 @@ def test_labels_name_each_direction():
     stack = jax.vmap(SE2)(jnp.zeros(2), jnp.zeros(2), jnp.zeros(2))
     assert tangent_labels(stack) == tuple(f"[{i}].{name}" for i in range(2) for name in ("x", "y", "rotation"))
     assert len(tangent_labels(nested(np.float32))) == DIMENSION
+
+
+def test_carry_takes_tangents_from_place_to_place(x64):
+    pose, delta = SE2(1.0, 2.0, 0.3), jnp.array([0.3, -0.2, 0.4])
+    target = retract(pose, jnp.array([0.5, 0.1, -0.2]))
+    found = carry(pose, delta, target)
+    step = 1e-6
+    for i, e in enumerate(step * np.eye(3)):
+        there, back = (local(target, retract(pose, delta + jnp.array(sign * e))) for sign in (1.0, -1.0))
+        np.testing.assert_allclose(found[:, i], (there - back) / (2 * step), atol=1e-8)
+    assert is_flat({"x": jnp.zeros(2), "n": jnp.arange(3)}) and not is_flat({"pose": pose, "x": jnp.zeros(2)})

@@ -7,8 +7,10 @@ from jaxloc.beliefs import (
     fixed_point,
     gates,
     gaussian,
+    mixture,
     particles,
     propagation,
+    reduction,
     resampling,
     squareroot,
     transport,
@@ -18,12 +20,18 @@ from jaxloc.beliefs.compounding import compose, invert, relative
 from jaxloc.beliefs.conditional import Motion, Sensor
 from jaxloc.beliefs.gates import chi2_cdf, chi2_quantile, gate
 from jaxloc.beliefs.gaussian import Gaussian, fuse
+from jaxloc.beliefs.mixture import Mixture
 from jaxloc.beliefs.particles import Particles
 from jaxloc.beliefs.propagation import propagate_linear, propagate_sampled, propagate_unscented
+from jaxloc.beliefs.reduction import Closeness, KullbackLeibler, MahalanobisDistance, reduce_mixture
 
 __all__ = [
+    "Closeness",
     "Gaussian",
     "KLDSize",
+    "KullbackLeibler",
+    "MahalanobisDistance",
+    "Mixture",
     "Motion",
     "Particles",
     "Sensor",
@@ -39,11 +47,14 @@ __all__ = [
     "gates",
     "gaussian",
     "invert",
+    "mixture",
     "particles",
     "propagate_linear",
     "propagate_sampled",
     "propagate_unscented",
     "propagation",
+    "reduce_mixture",
+    "reduction",
     "relative",
     "resampling",
     "squareroot",

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Key
 
 from jaxloc.beliefs.gaussian import Gaussian
 from jaxloc.beliefs.squareroot import cholesky
-from jaxloc.poses import local, retract, tangent_dimension
+from jaxloc.poses import is_flat, local, retract
 from jaxloc.poses.group import matmul
 
 _MEAN_STEPS = 3  # of the intrinsic mean on a manifold; the error shrinks as the square of the spread each time
@@ -141,7 +141,7 @@ def _images(f: Callable[[Any], Any], gaussian: Gaussian, deltas: Float[Array, "k
 def _moments(samples: Any, start: Any, weights: Float[Array, " k"], weights_covariance: Float[Array, " k"]) -> Gaussian:
     """Intrinsic mean of weighted samples, from a start near it, and the covariance around it."""
     center = start
-    for _ in range(1 if _is_flat(start) else _MEAN_STEPS):
+    for _ in range(1 if is_flat(start) else _MEAN_STEPS):
         center = retract(center, jnp.sum(weights[:, None] * _deviations(center, samples), axis=0))
     deviations = _deviations(center, samples)
     return Gaussian(center, matmul(deviations.T, weights_covariance[:, None] * deviations))
@@ -149,8 +149,3 @@ def _moments(samples: Any, start: Any, weights: Float[Array, " k"], weights_cova
 
 def _deviations(center: Any, samples: Any) -> Float[Array, "k d"]:
     return jax.vmap(lambda sample: local(center, sample))(samples)
-
-
-def _is_flat(value: Any) -> bool:
-    """Whether a pytree holds no poses: its tangent has as many entries as its arrays."""
-    return sum(leaf.size for leaf in jax.tree.leaves(value)) == tangent_dimension(value)

@@ -7,9 +7,9 @@ References:
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxloc.beliefs import chi2_quantile
+from jaxloc.beliefs import chi2_cdf, chi2_quantile
 from jaxloc.poses import Trajectory
 
 
@@ -35,6 +35,26 @@ class Interval(eqx.Module):
 
     lower: Float[Array, "*s"]
     upper: Float[Array, "*s"]
+
+
+class Calibration(eqx.Module):
+    """Squared errors beside the chi-square distribution that they should have.
+
+    Attributes:
+        edges: of the histogram's bins.
+        density: of the values that are ok; those beyond the last edge are in no bin.
+        expected: density of chi-square in the same bins.
+        distance: of Kolmogorov and Smirnov: largest difference of the two cumulative distributions.
+        coverage: fraction of the values inside the confidence ellipsoids.
+        count: how many values are ok.
+    """
+
+    edges: Float[Array, " e"]
+    density: Float[Array, " b"]
+    expected: Float[Array, " b"]
+    distance: Float[Array, ""]
+    coverage: Float[Array, " k"]
+    count: Int[Array, ""]
 
 
 @eqx.filter_jit
@@ -155,3 +175,56 @@ def coverage(
     limits = chi2_quantile(jnp.array(probabilities, values.dtype), degrees_of_freedom)
     inside = (values[None] <= limits[:, None]) & ok[None]
     return jnp.sum(inside, axis=1).astype(values.dtype) / jnp.maximum(jnp.sum(ok), 1).astype(values.dtype)
+
+
+@eqx.filter_jit
+def calibration(
+    squared: SquaredErrors,
+    degrees_of_freedom: int,
+    *,
+    num_bins: int = 20,
+    probabilities: tuple[float, ...] = (0.5, 0.9, 0.95),
+) -> Calibration:
+    """How the squared errors of an estimator are distributed, against chi-square.
+
+    Args:
+        squared: NEES values, such as those of positions: ``jax.vmap(nees)(errors, covariances)``.
+        degrees_of_freedom: of one value.
+        num_bins: of the histogram, which ends at chi-square's quantile of 99.9 %.
+        probabilities: of the ellipsoids.
+
+    Returns:
+        Histogram, distance and coverage; the distance is one, and all else zero, where no value is ok.
+
+    References:
+        Bar-Shalom et al. 2001, section 5.4.2. [T-89], [T-90]
+
+    Example:
+        >>> values = jnp.sum(jax.random.normal(jax.random.key(0), (1000, 3)) ** 2, axis=1)
+        >>> fit = calibration(SquaredErrors(values, jnp.ones(1000, bool)), 3)
+        >>> bool(fit.distance < 0.05), bool(abs(fit.coverage[1] - 0.9) < 0.03)
+        (True, True)
+    """
+    values, ok = squared.values.ravel(), squared.ok.ravel()
+    dtype = values.dtype
+    count = jnp.sum(ok, dtype=jnp.int32)
+    size = jnp.maximum(count, 1).astype(dtype)
+    ordered = jnp.sort(jnp.where(ok, values, jnp.inf))
+    rank = jnp.arange(values.shape[0], dtype=jnp.int32)
+    below = chi2_cdf(jnp.where(rank < count, ordered, 0.0), degrees_of_freedom)
+    step = rank.astype(dtype) / size
+    gaps = jnp.maximum(step + 1.0 / size - below, below - step)
+    distance = jnp.max(jnp.where(rank < count, gaps, 0.0), initial=0.0)
+
+    last = chi2_quantile(jnp.array(0.999, dtype), degrees_of_freedom)
+    edges = jnp.linspace(0.0, 1.0, num_bins + 1, dtype=dtype) * last
+    width = last / num_bins
+    upto = jnp.searchsorted(ordered, edges).astype(dtype)
+    return Calibration(
+        edges,
+        jnp.diff(upto) / (size * width),
+        jnp.diff(chi2_cdf(edges, degrees_of_freedom)) / width,
+        jnp.where(count > 0, distance, 1.0),
+        coverage(squared, degrees_of_freedom, probabilities=probabilities),
+        count,
+    )

@@ -14,8 +14,6 @@ from jaxloc.filters.kalman import (
     GaussianFilter,
     Reading,
     Spread,
-    carry,
-    is_flat,
     judge,
     noise_root,
     read_linearized,
@@ -24,7 +22,7 @@ from jaxloc.filters.kalman import (
     spread_motion,
     spread_reading,
 )
-from jaxloc.poses import retract
+from jaxloc.poses import carry, is_flat, retract
 from jaxloc.solvers.robust import Loss, Quadratic
 
 _SMALLEST_WEIGHT = 1e-8  # of a robust kernel: the noise of a rejected measurement grows by ten thousand

@@ -20,7 +20,7 @@ from jaxloc.beliefs import Gaussian, Motion, Sensor, chi2_quantile
 from jaxloc.beliefs.conditional import innovation, mask_covariance
 from jaxloc.beliefs.squareroot import cholesky, downdate, product, triangularize, whiten
 from jaxloc.filters.contract import Filter, GaussianInfo, GaussianState
-from jaxloc.poses import local, retract, tangent_dimension
+from jaxloc.poses import carry, is_flat, retract
 
 
 class LinearSensor(Sensor):
@@ -264,16 +264,6 @@ def recenter(mean: Any, delta: Float[Array, " d"], root: Float[Array, "d d"]) ->
     """
     moved = retract(mean, delta)
     return moved, root if is_flat(mean) else triangularize(product(carry(mean, delta, moved), root))
-
-
-def carry(mean: Any, delta: Float[Array, " d"], target: Any) -> Float[Array, "d d"]:
-    """Derivative of ``local(target, retract(mean, delta + e))`` by e."""
-    return jax.jacfwd(lambda e: local(target, retract(mean, delta + e)))(jnp.zeros_like(delta))
-
-
-def is_flat(value: Any) -> bool:
-    """Whether a pytree holds no poses: its tangent has as many entries as its arrays."""
-    return sum(leaf.size for leaf in jax.tree.leaves(value)) == tangent_dimension(value)
 
 
 def select(condition: Bool[Array, ""], new: Any, old: Any) -> Any:

@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxloc.beliefs import Gaussian
 from jaxloc.beliefs.squareroot import cholesky, product, triangularize, whiten
 from jaxloc.filters.contract import Filter, FilterState, GaussianInfo, GaussianState, History, Info
-from jaxloc.filters.kalman import GaussianFilter, carry, finite_or_zero, is_flat, recenter, select
+from jaxloc.filters.kalman import GaussianFilter, finite_or_zero, recenter, select
 from jaxloc.filters.smoothers import Step, regress, smooth_step
 from jaxloc.filters.unscented import intrinsic_mean
-from jaxloc.poses import local
+from jaxloc.poses import carry, is_flat, local
 
 
 class ModesState(FilterState):

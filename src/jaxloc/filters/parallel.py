@@ -13,18 +13,9 @@ from jaxloc.beliefs.squareroot import cholesky, product, triangularize, whiten
 from jaxloc.filters.blocks import Line, Linearized, filter_blocks, hold, smooth_blocks
 from jaxloc.filters.contract import GaussianState, History
 from jaxloc.filters.extended import ExtendedKalmanFilter
-from jaxloc.filters.kalman import (
-    GaussianFilter,
-    KalmanFilter,
-    carry,
-    finite_or_zero,
-    is_flat,
-    noise_root,
-    recenter,
-    select,
-)
+from jaxloc.filters.kalman import GaussianFilter, KalmanFilter, finite_or_zero, noise_root, recenter, select
 from jaxloc.filters.smoothers import look_back, regress
-from jaxloc.poses import local, retract
+from jaxloc.poses import carry, is_flat, local, retract
 
 
 @eqx.filter_jit

@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc.beliefs.squareroot import product, triangularize, whiten
 from jaxloc.filters.contract import GaussianState, History
-from jaxloc.filters.kalman import GaussianFilter, carry, finite_or_zero, is_flat, recenter, select
-from jaxloc.poses import local
+from jaxloc.filters.kalman import GaussianFilter, finite_or_zero, recenter, select
+from jaxloc.poses import carry, is_flat, local
 
 
 class Step(eqx.Module):

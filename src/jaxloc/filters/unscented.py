@@ -17,8 +17,8 @@ from jaxloc.beliefs import Motion, Sensor
 from jaxloc.beliefs.conditional import innovation
 from jaxloc.beliefs.squareroot import cholesky, product
 from jaxloc.filters.contract import GaussianState
-from jaxloc.filters.kalman import GaussianFilter, Reading, Spread, is_flat, noise_root
-from jaxloc.poses import local, retract
+from jaxloc.filters.kalman import GaussianFilter, Reading, Spread, noise_root
+from jaxloc.poses import is_flat, local, retract
 
 _MEAN_STEPS = 3  # of the intrinsic mean on a manifold; the error shrinks as the square of the spread each time
 

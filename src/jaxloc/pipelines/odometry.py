@@ -91,6 +91,24 @@ class Step(eqx.Module):
     inlier: np.ndarray
 
 
+class Evidence(eqx.Module):
+    """What a motion was found from.
+
+    Attributes:
+        reference: features of the frame that this one was matched with.
+        current: features of this frame.
+        matches: between both.
+        motion: of the camera from the reference to this frame.
+        age: how many frames ago the reference was.
+    """
+
+    reference: StereoFeatures
+    current: StereoFeatures
+    matches: StereoMatches
+    motion: CameraMotion
+    age: int
+
+
 class _Keyframe(eqx.Module):
     """The frame that others are matched with."""
 
@@ -131,7 +149,7 @@ def steps(frames: Iterable[Any], rig: StereoRig, config: Config | None = None) -
     References:
         KELLY 9.2.4.3.3 [K-86, K-87]; thesis figure 3.3 for the front end [T-68...T-71].
     """
-    for step, _ in _run(frames, rig, Config() if config is None else config):
+    for step, _ in steps_with_evidence(frames, rig, config):
         yield step
 
 
@@ -153,9 +171,9 @@ def calibrate_disparity(frames: Iterable[Any], rig: StereoRig, config: Config | 
         ValueError: no motion could be measured.
     """
     votes = []
-    for step, found in _run(frames, rig, Config() if config is None else config):
+    for step, found in steps_with_evidence(frames, rig, config):
         if found is not None and step.ok:
-            estimate = estimate_disparity_offset(rig, *found)
+            estimate = estimate_disparity_offset(rig, found.matches, found.motion)
             votes += [(float(estimate.value[1]), float(estimate.covariance[6, 6]))] * bool(estimate.ok)
     if not votes:
         raise ValueError("No motion could be measured in these frames: the disparity offset stays unknown.")
@@ -167,10 +185,11 @@ def calibrate_disparity(frames: Iterable[Any], rig: StereoRig, config: Config | 
     return Gaussian(jnp.array([mean]), jnp.array([[variance]]))
 
 
-def _run(
-    frames: Iterable[Any], rig: StereoRig, config: Config
-) -> Iterator[tuple[Step, tuple[StereoMatches, CameraMotion] | None]]:
-    """Steps, with what they were made of."""
+def steps_with_evidence(
+    frames: Iterable[Any], rig: StereoRig, config: Config | None = None
+) -> Iterator[tuple[Step, Evidence | None]]:
+    """`steps`, each with what it was found from: None for the first."""
+    config = Config() if config is None else config
     keys = _keys(config.seed)
     keyframe: _Keyframe | None = None
     motion = SE3.identity()
@@ -190,9 +209,10 @@ def _run(
             pose = compounding.compose(keyframe.pose, to_current)
             relative = compounding.compose(_known(keyframe.to_last.inverse()), to_current)
         step = _step(frame, pose, relative, matches, found, ok, watch)
+        evidence = Evidence(keyframe.features, features, matches, found, keyframe.age + 1)
         keyframe = _next_keyframe(keyframe, features, pose, to_current.mean, step, config)
         motion = relative.mean
-        yield step, (matches, found)
+        yield step, evidence
 
 
 def _measure(

@@ -2,7 +2,7 @@
 
 from jaxloc.poses import compound, manifold, planar, rotation, se2, se3, series, trajectory
 from jaxloc.poses.group import Group
-from jaxloc.poses.manifold import local, retract, tangent_dimension, tangent_labels
+from jaxloc.poses.manifold import carry, is_flat, local, retract, tangent_dimension, tangent_labels
 from jaxloc.poses.rotation import SO2, SO3, wrap_angle
 from jaxloc.poses.se2 import SE2
 from jaxloc.poses.se3 import SE3
@@ -15,9 +15,11 @@ __all__ = [
     "SO3",
     "Group",
     "Trajectory",
+    "carry",
     "chain",
     "compound",
     "interpolate",
+    "is_flat",
     "local",
     "manifold",
     "planar",

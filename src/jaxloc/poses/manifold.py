@@ -132,3 +132,25 @@ def local(value: Any, other: Any) -> Float[Array, " d"]:
     if not parts:
         raise ValueError("The value holds neither poses nor floating arrays: it has no tangent.")
     return jnp.concatenate(parts)
+
+
+def is_flat(value: Any) -> bool:
+    """Whether a pytree holds no poses, so that all its tangent spaces are one.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> jl.poses.is_flat(jnp.zeros(3)), jl.poses.is_flat(jl.poses.SE2(0.0, 0.0, 0.0))
+        (True, False)
+    """
+    return not any(_is_group(node) for node in _leaves(value))
+
+
+def carry(value: Any, delta: Float[Array, " d"], target: Any) -> Float[Array, "d d"]:
+    """Derivative of ``local(target, retract(value, delta + e))`` by e: takes tangents from one place to another.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> jl.poses.carry(jnp.zeros(2), jnp.ones(2), jnp.ones(2)).tolist()
+        [[1.0, 0.0], [0.0, 1.0]]
+    """
+    return jax.jacfwd(lambda e: local(target, retract(value, delta + e)))(jnp.zeros_like(delta))

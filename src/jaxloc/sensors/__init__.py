@@ -1,6 +1,18 @@
 """What is measured: forward models of cameras and stereo rigs, and their records."""
 
-from jaxloc.sensors import camera, ceiling, distortion, increments, landmarks, laser, maps, odometer, ranging, rig
+from jaxloc.sensors import (
+    camera,
+    ceiling,
+    distortion,
+    increments,
+    landmarks,
+    laser,
+    maps,
+    moving_objects,
+    odometer,
+    ranging,
+    rig,
+)
 from jaxloc.sensors.camera import Pinhole
 from jaxloc.sensors.ceiling import CeilingMosaic, CeilingSensor
 from jaxloc.sensors.distortion import BrownConrady, KannalaBrandt, Lens
@@ -8,6 +20,7 @@ from jaxloc.sensors.increments import Increment, IncrementMotion
 from jaxloc.sensors.landmarks import RangeBearing, RangeBearingSensor
 from jaxloc.sensors.laser import BeamModel, LaserScan, LikelihoodField
 from jaxloc.sensors.maps import DistanceField, FreeSpace, OccupancyMap
+from jaxloc.sensors.moving_objects import MovingObject, MovingObjectSensor
 from jaxloc.sensors.odometer import DifferentialDrive, OdometryMotion
 from jaxloc.sensors.ranging import Range, RangeSensor, RangingMotion, RangingState
 from jaxloc.sensors.rig import StereoRig
@@ -26,6 +39,8 @@ __all__ = [
     "LaserScan",
     "Lens",
     "LikelihoodField",
+    "MovingObject",
+    "MovingObjectSensor",
     "OccupancyMap",
     "OdometryMotion",
     "Pinhole",
@@ -43,6 +58,7 @@ __all__ = [
     "landmarks",
     "laser",
     "maps",
+    "moving_objects",
     "odometer",
     "ranging",
     "rig",

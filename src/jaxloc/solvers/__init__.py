@@ -1,6 +1,17 @@
 """How a residual is minimized, and how sure the answer is."""
 
-from jaxloc.solvers import closed_form, estimate, gauss_newton, graduated, least_squares, linear, problem, robust
+from jaxloc.solvers import (
+    assignment,
+    closed_form,
+    estimate,
+    gauss_newton,
+    graduated,
+    least_squares,
+    linear,
+    problem,
+    robust,
+)
+from jaxloc.solvers.assignment import Assignment, assign
 from jaxloc.solvers.closed_form import PointAlignment, Similarity, align_points, align_scaled_points
 from jaxloc.solvers.estimate import Estimate, Observability, Status
 from jaxloc.solvers.gauss_newton import Dogleg, GaussNewton, LevenbergMarquardt, Solver
@@ -12,6 +23,7 @@ from jaxloc.solvers.ransac import Candidates, Consensus, ransac, required_hypoth
 from jaxloc.solvers.robust import Barron, Cauchy, GemanMcClure, Huber, Loss, Quadratic, Tukey
 
 __all__ = [
+    "Assignment",
     "Barron",
     "Candidates",
     "Cauchy",
@@ -36,6 +48,8 @@ __all__ = [
     "Tukey",
     "align_points",
     "align_scaled_points",
+    "assign",
+    "assignment",
     "closed_form",
     "estimate",
     "gauss_newton",

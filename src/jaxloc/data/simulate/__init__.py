@@ -1,6 +1,6 @@
 """Synthetic worlds that give the library's own records, with exact truth."""
 
-from jaxloc.data.simulate import camera, landmarks, laser, points, rendering, textures, world
+from jaxloc.data.simulate import camera, landmarks, laser, points, rendering, targets, textures, world
 
 __all__ = [
     "camera",
@@ -8,6 +8,7 @@ __all__ = [
     "laser",
     "points",
     "rendering",
+    "targets",
     "textures",
     "world",
 ]

@@ -1,0 +1,120 @@
+"""Sums of weighted normals with room for a fixed number of them."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxloc.beliefs.gaussian import Gaussian
+from jaxloc.beliefs.squareroot import cholesky
+from jaxloc.poses import is_flat, local, retract, tangent_dimension
+from jaxloc.poses.group import matmul
+
+_MEAN_STEPS = 3
+
+
+class Mixture(eqx.Module):
+    """``D(x) = sum_i w_i N(x; m_i, P_i)``: a density when the weights sum to one, else an intensity.
+
+    Empty slots have weight zero; their means and covariances are finite numbers without a meaning.
+
+    Args:
+        weights: w, never negative; of an intensity, their sum is an expected number of objects.
+        means: m, vectors, poses, or any pytree of them, stacked along a leading axis.
+        covariances: P, each in the tangent space of its mean.
+        labels: whatever numbers follow the components around, such as those of tracks. Zeros when left out.
+
+    References:
+        Vo and Ma, "The Gaussian mixture probability hypothesis density filter", IEEE TSP 2006 [T-45].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> two = jl.beliefs.Mixture(jnp.array([0.5, 1.0]), jnp.eye(2), jnp.stack([jnp.eye(2)] * 2))
+        >>> float(two.mass), round(float(jnp.exp(two.log_intensity(jnp.zeros(2)))), 4)
+        (1.5, 0.1448)
+    """
+
+    weights: Float[Array, " k"]
+    means: Any
+    covariances: Float[Array, "k d d"]
+    labels: Int[Array, " k"]
+
+    def __init__(self, weights: Any, means: Any, covariances: Any, labels: Any = None):
+        self.weights, self.means, self.covariances = weights, means, covariances
+        self.labels = jnp.zeros(weights.shape, jnp.int32) if labels is None else labels
+
+    @staticmethod
+    def empty(capacity: int, example: Any) -> "Mixture":
+        """No components yet, with room for some.
+
+        Args:
+            capacity: how many there is room for.
+            example: a state, for its structure.
+        """
+        size = tangent_dimension(example)
+        dtype = jnp.result_type(*[leaf for leaf in jax.tree.leaves(example) if eqx.is_inexact_array(leaf)])
+        means = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (capacity, *leaf.shape)), example)
+        covariances = jnp.broadcast_to(jnp.eye(size, dtype=dtype), (capacity, size, size))
+        return Mixture(jnp.zeros(capacity, dtype), means, covariances)
+
+    @property
+    def capacity(self) -> int:
+        """How many components there is room for."""
+        return self.weights.shape[0]
+
+    @property
+    def valid(self) -> Bool[Array, " k"]:
+        """Which slots hold a component."""
+        return self.weights > 0.0
+
+    @property
+    def mass(self) -> Float[Array, ""]:
+        """Sum of the weights."""
+        return jnp.sum(self.weights)
+
+    def take(self, indices: Int[Array, " n"]) -> "Mixture":
+        """Some of the components, by their places."""
+        return jax.tree.map(lambda leaf: leaf[indices], self)
+
+    def concatenate(self, other: "Mixture") -> "Mixture":
+        """The sum of two mixtures, one after the other."""
+        return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), self, other)
+
+    def padded(self, capacity: int) -> "Mixture":
+        """With room for more components."""
+        more = self.take(jnp.zeros(max(capacity - self.capacity, 0), jnp.int32))
+        return self.concatenate(more.scaled(0.0))
+
+    def scaled(self, factor: Any) -> "Mixture":
+        """The mixture times a number, or each component times its own."""
+        return Mixture(self.weights * factor, self.means, self.covariances, self.labels)
+
+    @eqx.filter_jit
+    def log_intensity(self, x: Any) -> Float[Array, ""]:
+        """``log D(x)``, with respect to volume in the tangent spaces; a log density when the weights sum to one."""
+        log_prob = jax.vmap(lambda mean, covariance: Gaussian(mean, covariance).log_prob(x))
+        terms = log_prob(self.means, self.covariances)
+        weights = jnp.where(self.valid, self.weights, 1.0)
+        return logsumexp(jnp.where(self.valid, jnp.log(weights) + terms, -jnp.inf))
+
+    @eqx.filter_jit
+    def gaussian(self) -> Gaussian:
+        """The normal with the moments of the mixture (of its density, that is divided by the mass)."""
+        best = jnp.argmax(self.weights)
+        center = jax.tree.map(lambda leaf: leaf[best], self.means)
+        total = jnp.where(self.mass > 0.0, self.mass, 1.0)
+        shares = jnp.where(self.mass > 0.0, self.weights / total, 1.0 / self.capacity)
+        for _ in range(1 if is_flat(center) else _MEAN_STEPS):
+            start = center
+            shift = matmul(shares, jax.vmap(lambda mean, start=start: local(start, mean))(self.means))
+            center = retract(center, shift)
+        apart = jax.vmap(lambda mean: local(center, mean))(self.means)
+        within = jnp.sum(shares[:, None, None] * self.covariances, axis=0)
+        return Gaussian(center, within + matmul(apart.T, shares[:, None] * apart))
+
+    def roots(self) -> Float[Array, "k d d"]:
+        """Lower triangular roots of the covariances."""
+        return jax.vmap(cholesky)(self.covariances)

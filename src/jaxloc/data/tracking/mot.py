@@ -1,0 +1,126 @@
+"""Boxes of the MOT challenge: ``frame, id, left, top, width, height, score, x, y, z`` (or class and visibility).
+
+Frames count from 1; commas or spaces separate. The detector's identities are -1 and are not read; true rows of score 0
+do not count.
+
+References:
+    Leal-Taixe et al., "MOTChallenge 2015: towards a benchmark for multi-target tracking", arXiv 1504.01942.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from jaxloc.data.sequence import DataError
+from jaxloc.data.tables import read_text
+from jaxloc.data.tracking.detections import Detections, LabelledTracks, Rows, assemble, assemble_tracks, check_frame
+from jaxloc.data.writing import write_file
+
+_FEWEST, _MOST = 7, 10
+
+
+def read_mot_detections(
+    path: Path | str, *, num_frames: int | None = None, capacity: int | None = None, rate: float = 25.0
+) -> Detections:
+    """Reads what a detector found (``det.txt``).
+
+    Detections with numbers that are not finite, or boxes without area, are left out and counted.
+
+    Args:
+        path: the file.
+        num_frames: how many frames there are; up to the last line where not given.
+        capacity: room of a frame; the surest stay.
+        rate: frames a second.
+
+    Returns:
+        The detections.
+
+    Raises:
+        DataError: when the file is missing, or a line is broken.
+    """
+    rows = _rows(*_read(path))
+    return assemble(path, rows, rate=rate, first=1, num_frames=num_frames, capacity=capacity)
+
+
+def read_mot_tracks(path: Path | str, *, num_frames: int | None = None, rate: float = 25.0) -> LabelledTracks:
+    """Reads true tracks (``gt.txt``), or those of a tracker.
+
+    Args:
+        path: the file.
+        num_frames: how many frames there are; up to the last line where not given.
+        rate: frames a second.
+
+    Returns:
+        The tracks.
+
+    Raises:
+        DataError: when the file is missing, a line is broken, or an identity is there twice in a frame.
+    """
+    values, lines = _read(path)
+    for identity, line in zip(values[:, 1], lines, strict=True):
+        if not 0 <= identity < 2**53 or identity != int(identity):
+            raise DataError(path, f"line {line}: {identity:g} is no identity (whole, from 0)")
+    counted = values[:, 6] != 0.0
+    rows = _rows(values[counted], lines[counted], values[counted, 1].astype(np.int64))
+    return assemble_tracks(path, rows, rate=rate, first=1, num_frames=num_frames)
+
+
+def write_mot(path: Path | str, tracks: LabelledTracks) -> None:
+    r"""Writes tracks as a result file of the benchmark, in one step.
+
+    Args:
+        path: the file.
+        tracks: boxes with identities.
+
+    Raises:
+        DataError: when it cannot be written.
+
+    Example:
+        >>> import jaxloc as jl, numpy as np, tempfile, pathlib
+        >>> one = np.array([1])
+        >>> rows = jl.data.tracking.detections.Rows(one, one, np.array([[1.0, 2.0, 4.0, 8.0]]), np.ones(1), 7 * one)
+        >>> tracks = jl.data.tracking.detections.assemble_tracks("a", rows, rate=25.0, first=1)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = pathlib.Path(folder) / "a.txt"
+        ...     jl.data.tracking.write_mot(path, tracks)
+        ...     path.read_text()
+        '1,7,1.00,2.00,3.00,6.00,1.0000,-1,-1,-1\n'
+    """
+    found, lines = tracks.detections, []
+    for frame, slot in np.argwhere(found.valid):
+        left, top, right, bottom = found.boxes[frame, slot]
+        box = f"{left:.2f},{top:.2f},{right - left:.2f},{bottom - top:.2f},{found.scores[frame, slot]:.4f}"
+        lines.append(f"{found.frames[frame]},{tracks.ids[frame, slot]},{box},-1,-1,-1\n")
+    write_file(path, "".join(lines))
+
+
+def _rows(
+    values: Float64[np.ndarray, "n 7"], lines: Int64[np.ndarray, " n"], ids: Int64[np.ndarray, " n"] | None = None
+) -> Rows:
+    boxes = np.column_stack([values[:, 2:4], values[:, 2:4] + values[:, 4:6]])
+    return Rows(lines, values[:, 0].astype(np.int64), boxes, values[:, 6], ids)
+
+
+def _read(path: Path | str) -> tuple[Float64[np.ndarray, "n 7"], Int64[np.ndarray, " n"]]:
+    """The first seven numbers of each line, and the lines they stand in."""
+    rows, lines = [], []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        words = line.replace(",", " ").split()
+        if not words:
+            continue
+        rows.append(_parse(path, number, words))
+        lines.append(number)
+    return np.array(rows, dtype=np.float64).reshape(len(rows), _FEWEST), np.array(lines, dtype=np.int64)
+
+
+def _parse(path: Path | str, line: int, words: Sequence[str]) -> list[float]:
+    if not _FEWEST <= len(words) <= _MOST:
+        raise DataError(path, f"line {line} has {len(words)} numbers, needs {_FEWEST} to {_MOST}")
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        raise DataError(path, f"line {line} holds something that is no number") from None
+    check_frame(path, line, values[0], first=1)
+    return values[:_FEWEST]

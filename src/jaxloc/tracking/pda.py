@@ -1,0 +1,202 @@
+"""Probabilistic data association: each track is updated by all measurements around it, weighed by what is probable."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from jaxloc.beliefs import Mixture
+from jaxloc.beliefs.squareroot import cholesky, product, triangularize
+from jaxloc.filters import GaussianFilter, GaussianState
+from jaxloc.filters.kalman import recenter, select
+from jaxloc.tracking.contract import Targets, Tracker, TrackerInfo
+from jaxloc.tracking.gating import Comparison
+from jaxloc.tracking.model import TargetModel
+from jaxloc.tracking.scan import Scan, examine, whole
+from jaxloc.tracking.tracks import (
+    ExistenceLife,
+    Life,
+    Tracks,
+    age_tracks,
+    extract_tracks,
+    miss,
+    open_tracks,
+    predict_tracks,
+    renew,
+)
+
+
+class Association(eqx.Module):
+    """How probable it is that each track was measured as each measurement.
+
+    Attributes:
+        pairs: beta, of track (row) and measurement (column).
+        missed: that a track has no measurement: the rest of its row.
+        log_normalizer: log of the sum over all joint associations of their weights.
+    """
+
+    pairs: Float[Array, "k m"]
+    missed: Float[Array, " k"]
+    log_normalizer: Float[Array, ""]
+
+
+class ProbabilisticDataAssociation(Tracker):
+    """Each track for itself: whatever is around it is its own measurement or clutter, never another track's (IPDA).
+
+    The state of a track becomes the normal density with the moments of its mixture over measurements; existence
+    follows. Tracks that come close share measurements: they may fall together, and several tracks of one target do not
+    give way to each other. `JointProbabilisticDataAssociation` costs little more.
+
+    Args:
+        model: what targets do, and what is seen of them; with a filter of the Kalman family.
+        capacity: how many tracks there is room for, tentative ones included.
+        gate: probability that a track's own measurement passes; None for no gate.
+        life: when tracks are confirmed and deleted.
+
+    Raises:
+        TypeError: if the filter of the model is not of the Kalman family.
+
+    References:
+        Bar-Shalom and Tse, "Tracking in a cluttered environment with probabilistic data association", Automatica 1975;
+        Musicki, Evans and Stankovic, "Integrated probabilistic data association", IEEE TAC 1994 [T-59].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> sensor = jl.filters.LinearSensor(jnp.eye(2, 4), jnp.eye(2))
+        >>> filt = jl.filters.KalmanFilter(jl.filters.ConstantVelocity(0.1, axes=2), sensor)
+        >>> birth = jl.tracking.PointBirth(0.1, 1e4, jnp.eye(2), jnp.ones(2))
+        >>> clutter = jl.tracking.UniformClutter(0.1, 1e4)
+        >>> model = jl.tracking.TargetModel(filt, detection=0.9, survival=0.99, clutter=clutter, birth=birth)
+        >>> tracker = jl.tracking.ProbabilisticDataAssociation(model, capacity=8)
+        >>> state = tracker.init(jl.beliefs.Mixture.empty(1, jnp.zeros(4)))
+        >>> state, _ = jl.filters.run(tracker, state, jnp.ones(4), jnp.ones((4, 1, 2)), jnp.ones((4, 1), bool))
+        >>> int(tracker.extract(state).valid.sum())
+        1
+    """
+
+    model: TargetModel
+    capacity: int = eqx.field(static=True, default=100)
+    gate: float | None = eqx.field(static=True, default=0.999)
+    life: Life = eqx.field(default_factory=ExistenceLife)
+
+    def __check_init__(self):
+        require_gaussian(self.model, "ProbabilisticDataAssociation")
+
+    def init(self, prior: Mixture | None) -> Tracks:
+        """Tracks of a prior, whose weights are probabilities; see `open_tracks`."""
+        return open_tracks(self.model, self.capacity, prior, self.life)
+
+    def predict(self, state: Tracks, control: Any, *, key: Key[Array, ""] | None = None) -> Tracks:
+        """Every track one step later."""
+        del key
+        return predict_tracks(self.model, state, control)
+
+    def update(
+        self, state: Tracks, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
+    ) -> tuple[Tracks, TrackerInfo]:
+        """The tracks given a scan."""
+        del key
+        scan = examine(self.model, state, measurement, valid, self.gate)
+        return absorb(state, scan, associate_alone(scan.log_odds, scan.log_missed), self.life)
+
+    def extract(self, state: Tracks) -> Targets:
+        """The confirmed tracks."""
+        return extract_tracks(state, self.life)
+
+
+def require_gaussian(model: TargetModel, name: str) -> None:
+    """Raises a `TypeError` when the filter of a model has no single normal density."""
+    if isinstance(model, TargetModel) and not isinstance(model.filter, GaussianFilter):
+        raise TypeError(
+            f"{name} needs a model with a filter of the Kalman family; got {type(model.filter).__name__}. "
+            "GlobalNearestNeighbor takes InteractingFilters."
+        )
+
+
+def associate_alone(log_odds: Float[Array, "k m"], log_missed: Float[Array, " k"]) -> Association:
+    """Association probabilities of each track as if there were no other: ``beta_ij = w_ij / (w_i0 + sum_l w_il)``.
+
+    Args:
+        log_odds: ``log w_ij`` of the pairs; minus infinity where they are impossible.
+        log_missed: ``log w_i0``.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> found = jl.tracking.pda.associate_alone(jnp.log(jnp.array([[3.0, 1.0]])), jnp.zeros(1))
+        >>> bool(jnp.allclose(found.pairs, jnp.array([[0.6, 0.2]]))), round(float(found.missed[0]), 3)
+        (True, 0.2)
+    """
+    weights, missed, scales = scaled_weights(log_odds, log_missed)
+    total = missed + jnp.sum(weights, axis=1)
+    normalizer = jnp.sum(jnp.log(total) + scales)
+    return Association(weights / total[:, None], missed / total, normalizer)
+
+
+def scaled_weights(
+    log_odds: Float[Array, "k m"], log_missed: Float[Array, " k"]
+) -> tuple[Float[Array, "k m"], Float[Array, " k"], Float[Array, " k"]]:
+    """Weights of pairs and of missing, divided by the largest of the track, and the logarithm of that."""
+    possible = jnp.isfinite(log_odds)
+    safe = jnp.where(possible, log_odds, 0.0)
+    largest = jnp.max(jnp.where(possible, safe, -jnp.inf), axis=1, initial=-jnp.inf)
+    scales = jax.lax.stop_gradient(jnp.maximum(largest, log_missed))
+    weights = jnp.where(possible, jnp.exp(jnp.where(possible, safe - scales[:, None], 0.0)), 0.0)
+    # Tracks that agree on a measurement by far must leave it to one: no missed detection is impossible.
+    least = float(jnp.finfo(weights.dtype).eps) ** 2
+    return weights, jnp.maximum(jnp.exp(log_missed - scales), least), scales
+
+
+def absorb(state: Tracks, scan: Scan, found: Association, life: Life) -> tuple[Tracks, TrackerInfo]:
+    """The tracks after a scan, given association probabilities; the newborn among what they leave unexplained."""
+    left = miss(state.existence, scan.detection)
+    hit = 1.0 - found.missed
+    existence = hit + found.missed * left
+    there = jnp.where(existence > 0.0, existence, 1.0)
+    moved = match_moments(state.states, scan.comparison, found.pairs / there[:, None])
+    states = jax.vmap(select)(jnp.any(found.pairs > 0.0, axis=1), moved, state.states)
+    aged = age_tracks(state, states, existence, hit > 0.5)
+    unexplained = 1.0 - jnp.sum(found.pairs, axis=0)
+    newborn = jnp.where(unexplained > 0.5, unexplained * scan.share, 0.0)
+    after, crowded = renew(aged, scan.newborn.states, newborn, life)
+    likelihood = scan.base + found.log_normalizer
+    ok = whole(after, likelihood)
+    after = select(ok, after, state)
+    return after, TrackerInfo(jnp.where(ok, likelihood, 0.0), ok, jnp.sum(after.existence), crowded)
+
+
+def match_moments(states: GaussianState, comparison: Comparison, weights: Float[Array, "k m"]) -> GaussianState:
+    """One normal density for each mixture over measurements (and none): same mean, same covariance.
+
+    With the root ``[[V, 0], [G, S]]`` of (measurement, state) and innovations in sigmas ``e_j``: the mean moves by
+    ``G sum_j beta_j e_j``, and ``P = S S^T + G (beta_0 I + cov e) G^T``. Everything added is positive, and none of the
+    densities of the mixture is formed.
+
+    Args:
+        states: predicted, stacked.
+        comparison: of them with the measurements.
+        weights: beta of each pair, given that the target exists.
+
+    References:
+        Bar-Shalom and Li, *Multitarget-Multisensor Tracking*, 1995, section 3.4 [T-59].
+    """
+
+    def one(state, root, residuals, beta):
+        size = residuals.shape[-1]
+        none = jnp.maximum(1.0 - jnp.sum(beta), 0.0)
+        shift = jnp.sum(beta[:, None] * residuals, axis=0)
+        apart = jnp.sqrt(_positive(beta))[:, None] * (residuals - shift[None, :])
+        apart = jnp.where(beta[:, None] > 0.0, apart, 0.0)
+        spread = none * (jnp.eye(size, dtype=root.dtype) + shift[:, None] * shift[None, :])
+        middle = cholesky(spread + jnp.sum(apart[:, :, None] * apart[:, None, :], axis=0))
+        gain, rest = root[size:, :size], root[size:, size:]
+        both = triangularize(jnp.concatenate([rest, product(gain, middle)], axis=1))
+        mean, both = recenter(state.mean, product(gain, shift), both)
+        return GaussianState(mean, both, state.step)
+
+    return jax.vmap(one)(states, comparison.roots, comparison.residuals, weights)
+
+
+def _positive(values: Float[Array, " m"]) -> Float[Array, " m"]:
+    return jnp.where(values > 0.0, values, 1.0)
