@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxloc.beliefs import Gaussian, Mixture
+from jaxloc.beliefs import Closeness, Gaussian, MahalanobisDistance, Mixture
 from jaxloc.filters import ConstantVelocity, KalmanFilter
 from jaxloc.pipelines.odometry import Config as OdometryConfig
+from jaxloc.pipelines.odometry import Evidence, steps_with_evidence
 from jaxloc.pipelines.odometry import Step as OdometryStep
-from jaxloc.pipelines.odometry import steps_with_evidence
 from jaxloc.poses import SE3
 from jaxloc.sensors import MovingObject, MovingObjectSensor, StereoRig
 from jaxloc.slam import CameraMotion, FlowOptions, GroupOptions, MovingObjects, find_moving, group_points
@@ -40,6 +40,7 @@ class Config(eqx.Module):
         sigma: standard deviation of a point's measurement, px.
         extent: standard deviation of the visible part's center in its object, m.
         capacity: components of the filter.
+        merge: which components are merged.
         confirm_frames: a track is reported once it was believed in so many frames.
         keep_weight: a track that was reported still is while its weight is at least this.
     """
@@ -55,6 +56,7 @@ class Config(eqx.Module):
     sigma: float = 0.4
     extent: float = 0.7
     capacity: int = 64
+    merge: Closeness = MahalanobisDistance()
     confirm_frames: int = 2
     keep_weight: float = 0.15
 
@@ -159,8 +161,30 @@ def steps(
         Thesis figure 3.3 [T-68], section 5.4 [T-78], [T-79]; static and dynamic points [T-4].
     """
     config = Config() if config is None else config
+    yield from follow(steps_with_evidence(frames, rig, config.odometry), rig, config, poses=poses)
+
+
+def follow(
+    odometry: Iterable[tuple[OdometryStep, Evidence | None]],
+    rig: StereoRig,
+    config: Config | None = None,
+    *,
+    poses: SE3 | None = None,
+) -> Iterator[Step]:
+    """`steps` for an odometry that runs, or ran, already.
+
+    Args:
+        odometry: its steps with evidence.
+        rig: the stereo rig.
+        config: options.
+        poses: as of `steps`.
+
+    Yields:
+        A step for each frame.
+    """
+    config = Config() if config is None else config
     state, memory, times = _start(config), _Memory(config), []
-    for index, (step, found) in enumerate(steps_with_evidence(frames, rig, config.odometry)):
+    for index, (step, found) in enumerate(odometry):
         times.append(step.time)
         pose = Gaussian(step.pose, jnp.asarray(step.covariance, step.pose.translation.dtype))
         if poses is not None:
@@ -230,7 +254,7 @@ def build_tracker(
         clutter=UniformClutter(config.clutter_rate, volume),
         birth=ObjectBirth(jnp.asarray(config.birth_rate, span.dtype), volume, sensor),
     )
-    return GmPhd(model, capacity=config.capacity, gate=0.999, extraction=config.keep_weight)
+    return GmPhd(model, capacity=config.capacity, closeness=config.merge, gate=0.999, extraction=config.keep_weight)
 
 
 @eqx.filter_jit
@@ -247,7 +271,7 @@ def _track(
 ) -> tuple[PhdState, Targets, Float[Array, "k 2"], Bool[Array, " k"], Float[Array, ""], MovingObject]:
     """A step of the filter: its state, the targets, where in the image and if in view, how many, what was measured."""
     turned = jnp.matmul(objects.velocities, pose.mean.rotation.matrix().T, precision="highest")
-    measured = MovingObject(pose.mean.apply(objects.positions), turned)
+    measured = jax.vmap(MovingObject)(pose.mean.apply(objects.positions), turned)
     tracker = build_tracker(rig, pose, span, size, config)
     state, info = tracker.update(tracker.predict(state, dt), measured, objects.valid & usable)
     targets = tracker.extract(state)

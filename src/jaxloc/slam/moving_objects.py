@@ -22,6 +22,7 @@ class GroupOptions(eqx.Module):
             three sigmas more, but at most by three times as much.
         slack: velocities within one object differ by so much beside their noise, m/s.
         probability: that velocities of one object pass for alike.
+        still: probability of a standing object to pass for one.
     """
 
     capacity: int = eqx.field(static=True, default=32)
@@ -30,6 +31,7 @@ class GroupOptions(eqx.Module):
     near: tuple[float, float, float] = eqx.field(static=True, default=(2.5, 1.5, 2.5))
     slack: float = eqx.field(static=True, default=1.5)
     probability: float = eqx.field(static=True, default=0.99)
+    still: float = eqx.field(static=True, default=0.9999)
 
 
 class MovingObjects(eqx.Module):
@@ -79,7 +81,8 @@ def group_points(points: MovingPoints, *, options: GroupOptions = GroupOptions()
     positions, position_covariances = _mean(member, points.positions, points.position_covariances)
     velocities, velocity_covariances = _mean(member, points.velocities, points.velocity_covariances)
     boxes = jax.vmap(lambda row: _box(points.uv, row > 0.0))(member)
-    valid = sizes >= options.fewest_points
+    squared = jax.vmap(lambda v, c: jnp.sum(whiten(cholesky(c), v) ** 2))(velocities, velocity_covariances)
+    valid = (sizes >= options.fewest_points) & ~gate(squared, 3, options.still)
     return MovingObjects(positions, velocities, position_covariances, velocity_covariances, boxes, sizes, valid)
 
 

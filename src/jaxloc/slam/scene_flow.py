@@ -21,6 +21,9 @@ from jaxloc.sensors import StereoRig
 from jaxloc.slam.stereo_matching import StereoFeatures
 from jaxloc.slam.visual_odometry import CameraMotion
 
+_STILL_CORRELATION = 0.5  # of a patch with one that stands where it would
+_AS_ALIKE = 0.1  # difference of correlations that says nothing
+
 
 class FlowOptions(eqx.Module):
     """What counts as a point that moves.
@@ -35,7 +38,7 @@ class FlowOptions(eqx.Module):
         farthest: depth beyond which velocities mean nothing, m.
         slowest: speed below which a point is taken to stand, m/s.
         fastest: speed that nothing exceeds, m/s.
-        probability: of a standing point to pass for one.
+        probability: of a standing point to pass for one; whole objects are tested more strictly later.
     """
 
     capacity: int = eqx.field(static=True, default=512)
@@ -43,11 +46,11 @@ class FlowOptions(eqx.Module):
     reach: tuple[float, float] = eqx.field(static=True, default=(150.0, 12.0))
     correlation: float = eqx.field(static=True, default=0.7)
     beside: float = eqx.field(static=True, default=2.0)
-    sigma: float = eqx.field(static=True, default=0.7)
+    sigma: float = eqx.field(static=True, default=0.5)
     farthest: float = eqx.field(static=True, default=70.0)
     slowest: float = eqx.field(static=True, default=1.5)
     fastest: float = eqx.field(static=True, default=60.0)
-    probability: float = eqx.field(static=True, default=0.999)
+    probability: float = eqx.field(static=True, default=0.9)
 
 
 class MovingPoints(eqx.Module):
@@ -116,9 +119,13 @@ def find_moving(
     expected, expected_covariance = _carry(before, pose)
     alike = matmul(before.patches, after.patches.T)
     both = before.valid[:, None] & after.valid[None, :]
-    still = _still(rig, expected, expected_covariance, after, options) & (alike > 0.5) & both
-    free = both & ~jnp.any(still, axis=1)[:, None] & ~jnp.any(still, axis=0)[None, :]
-    near = _within(rig, expected, before, after, dt, options) & free
+    near = _within(rig, expected, before, after, dt, options) & both
+    still = _still(rig, expected, expected_covariance, after, options) & both & (alike > _STILL_CORRELATION)
+    # On a textured object some patch always lies where it would stand: it counts if none elsewhere is more alike.
+    best = jnp.where(near | still, alike, -1.0)
+    still = still & (alike > jnp.max(best, axis=1, keepdims=True) - _AS_ALIKE)
+    still = still & (alike > jnp.max(best, axis=0, keepdims=True) - _AS_ALIKE)
+    near = near & ~jnp.any(still, axis=1)[:, None] & ~jnp.any(still, axis=0)[None, :]
     score = jnp.where(near & (alike > options.correlation), alike, -1.0)
     partner, back = jnp.argmax(score, axis=1), jnp.argmax(score, axis=0)
     mutual = back[partner] == jnp.arange(score.shape[0])
