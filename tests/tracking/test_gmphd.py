@@ -423,9 +423,7 @@ def test_published_scenario():  # T-74
         survival=scenario.survival,
         clutter=jl.tracking.UniformClutter(scenario.clutter_rate, scenario.clutter_volume),
         birth=jl.tracking.StaticBirth(
-            jl.beliefs.Mixture(
-                scenario.birth_weights, scenario.birth_means, jnp.stack([scenario.birth_covariance] * 4)
-            )
+            jl.beliefs.Mixture(scenario.birth_weights, scenario.birth_means, jnp.stack([scenario.birth_covariance] * 4))
         ),
     )
     phd = jl.tracking.GmPhd(model, capacity=60, gate=0.999)

@@ -66,7 +66,7 @@ def demo(
     frames: Annotated[int, typer.Option(min=2, help="Number of stereo frames.")] = 60,
     seed: Annotated[int, typer.Option(min=0, help="Which street.")] = 0,
 ) -> int:
-    """Drive along a synthetic street and write a report: no data needed."""
+    """Drive along a synthetic street, find the path and what moves, and write reports: no data needed."""
     from jaxloc.cli import odometry as command
 
     return command.run_demo(out, config, num_frames=frames, seed=seed)
@@ -96,3 +96,53 @@ def localize(
     from jaxloc.cli import localize as command
 
     return command.run_log(log, map_path, start, reference, out, config)
+
+
+@app.command()
+def track(
+    sequence: Annotated[
+        Path | None, typer.Argument(help="Stereo folder in KITTI layout: image_0, image_1, calib.txt, times.txt.")
+    ] = None,
+    detections: Annotated[
+        Path | None,
+        typer.Option("--detections", metavar="FILE", help="Ready detections, in place of a SEQUENCE: KITTI or MOT."),
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option("--poses", metavar="FILE", help="Camera poses as KITTI rows, camera to world.")
+    ] = None,
+    calib: Annotated[
+        Path | None, typer.Option("--calib", metavar="FILE", help="KITTI tracking calibration, for u and v of tracks.")
+    ] = None,
+    form: Annotated[
+        str, typer.Option("--format", metavar="NAME", help="Of --detections: auto, kitti or mot.")
+    ] = "auto",
+    tracker: Annotated[
+        str, typer.Option("--tracker", metavar="NAME", help="For --detections: gmphd, jpda or gnn.")
+    ] = "gmphd",
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", metavar="FILE", help="True tracks in the format of --detections, to be compared with."),
+    ] = None,
+    out: _Out = Path("out"),
+    config: _Config = None,
+) -> int:
+    """Track what moves: from a stereo camera, or from the detections of any detector.
+
+    Writes tracks.csv, metrics.json, report.html and config.yaml; of detections also tracks_mot.txt (frames from 1), of
+    a stereo camera also trajectory.txt and pictures. Rows of tracks.csv are in m in the frame of the first camera; of
+    MOT detections they are of the center of the box in px, and z, vz and var_z are empty.
+    """
+    if (sequence is None) == (detections is None):
+        raise typer.BadParameter("give either a SEQUENCE or --detections FILE")
+    if detections is None:
+        if any(given is not None for given in (calib, truth)) or (form, tracker) != ("auto", "gmphd"):
+            raise typer.BadParameter("--calib, --format, --tracker and --truth go with --detections")
+        from jaxloc.cli import track_stereo
+
+        return track_stereo.run_recording(sequence, poses, out, config)
+    from jaxloc.cli import track as command
+
+    for name, value, known in (("--format", form, command.FORMATS), ("--tracker", tracker, command.TRACKERS)):
+        if value not in known:
+            raise typer.BadParameter(f"{name} is {value!r}, must be one of {', '.join(known)}")
+    return command.run_detections(command.Inputs(detections, form, poses, calib, truth, tracker), out, config)

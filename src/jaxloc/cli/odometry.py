@@ -5,10 +5,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 import typer
 
-from jaxloc.cli import configuration, odometry_summary, results, session
+from jaxloc.cli import configuration, odometry_summary, results, session, track_stereo
 from jaxloc.data import DataError, StereoFrame, StereoSequence, covariance, kitti, simulate_street, tum
 from jaxloc.data.writing import RowWriter
 
@@ -37,7 +38,7 @@ def run_recording(folder: Path, poses: Path | None, out: Path, config_path: Path
 
 
 def run_demo(out: Path, config_path: Path | None, *, num_frames: int, seed: int) -> int:
-    """Runs odometry on a synthetic street.
+    """Runs odometry on a synthetic street, then the tracker of moving objects, which writes to ``moving_objects``.
 
     Args:
         out: folder for the results.
@@ -54,7 +55,14 @@ def run_demo(out: Path, config_path: Path | None, *, num_frames: int, seed: int)
     config = _prepare(out, config_path)
     sequence = simulate_street(num_frames=num_frames, seed=seed)
     inputs = {"command": "demo", "frames": num_frames, "seed": seed}
-    return _run(sequence, config, out, inputs, title="Stereo odometry on a synthetic street")
+    code = _run(sequence, config, out, inputs, title="Stereo odometry on a synthetic street")
+    if code:
+        return code
+    from jaxloc.pipelines import datmo
+
+    objects = eqx.tree_at(lambda c: c.odometry, datmo.Config(), config)
+    title = "Moving objects on a synthetic street"
+    return track_stereo.run_sequence(sequence, objects, out / "moving_objects", inputs, title=title)
 
 
 def _prepare(out: Path, config_path: Path | None) -> Any:

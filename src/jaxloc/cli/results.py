@@ -3,7 +3,7 @@
 import json
 import math
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jaxloc
 from jaxloc.cli import configuration
@@ -11,6 +11,7 @@ from jaxloc.data.writing import write_file
 from jaxloc.evaluation import report
 
 
+@runtime_checkable
 class Record(Protocol):
     """What a run says of itself."""
 

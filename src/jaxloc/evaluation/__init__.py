@@ -1,6 +1,18 @@
 """Metrics, plots and reports."""
 
-from jaxloc.evaluation import alignments, consistency, drift, identities, plot, plot_map, report, targets, trajectories
+from jaxloc.evaluation import (
+    alignments,
+    consistency,
+    drift,
+    identities,
+    plot,
+    plot_map,
+    plot_objects,
+    plot_tracks,
+    report,
+    targets,
+    trajectories,
+)
 from jaxloc.evaluation.alignments import NoAlignment, RigidAlignment, SimilarityAlignment
 from jaxloc.evaluation.drift import SegmentErrors, end_drift_percent, segment_errors
 from jaxloc.evaluation.identities import BoxOverlap, PointDistance, clear_mot, compare, hota, id_f1
@@ -35,6 +47,8 @@ __all__ = [
     "ospa2",
     "plot",
     "plot_map",
+    "plot_objects",
+    "plot_tracks",
     "report",
     "rpe",
     "segment_errors",

@@ -13,10 +13,11 @@ from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc.beliefs import Gaussian, Sensor
 from jaxloc.poses.group import as_floats, matmul
-from jaxloc.tracking import Clutter, Detection, MeasuredBirth, PhdState, Targets, Tracker, TrackerInfo
+from jaxloc.tracking import Clutter, Detection, MeasuredBirth, PhdState, Targets, Tracker, TrackerInfo, gmphd
 
 SOLID, BOX = 4, 5  # entries of a measurement
-_NEAREST = 1.0  # depth that a camera sees from, m
+LEAST = 0.02  # existence of targets that are looked at
+NEAREST = 1.0  # depth that a camera sees from, m
 _ALWAYS, _NEVER = 0.99, 0.01  # no detector is surer of itself
 
 
@@ -97,7 +98,9 @@ class PlaceSensor(Sensor):
         del measurement
         noise, camera = self.noise, self.camera.astype(state.dtype)
         if self.size == BOX:
-            sigmas = jnp.full(self.size, noise.score, state.dtype).at[: self.size - 1].set(noise.box * jnp.abs(state[3]))
+            sigmas = (
+                jnp.full(self.size, noise.score, state.dtype).at[: self.size - 1].set(noise.box * jnp.abs(state[3]))
+            )
             return jnp.diag(sigmas**2)
         axis = camera[:3, 2]
         depth = jnp.maximum(jnp.sum(axis * (state[:3] - camera[:3, 3])), 0.0)
@@ -218,7 +221,9 @@ class WatchedTracker(Tracker):
         return inner.update(state, measurement.values, valid, key=key)
 
     def extract(self, state: Any) -> Targets:
-        """The inner tracker's targets."""
+        """All targets that are not quite unlikely; those of a PHD filter may share a label."""
+        if isinstance(state, PhdState):
+            return gmphd.extract(state.mixture, threshold=LEAST, copies=False)
         return self.inner.extract(state)
 
 
@@ -235,4 +240,4 @@ def is_in_view(places: Float[Array, "k 3"], camera: Float[Array, "4 4"], half_vi
         [True, False, False]
     """
     seen = matmul(places - camera[None, :3, 3].astype(places.dtype), camera[:3, :3].astype(places.dtype))
-    return (seen[:, 2] > _NEAREST) & (jnp.abs(seen[:, 0]) < half_view * jnp.maximum(seen[:, 2], 0.0))
+    return (seen[:, 2] > NEAREST) & (jnp.abs(seen[:, 0]) < half_view * jnp.maximum(seen[:, 2], 0.0))

@@ -1,0 +1,38 @@
+"""Pictures of moving objects: what is drawn, and where."""
+
+import io
+
+import cv2
+import numpy as np
+
+from jaxloc.evaluation import plot_objects
+
+
+def test_points_boxes_and_labels_are_drawn_where_they_are():
+    image = np.full((60, 120), 100, np.uint8)
+    points, boxes = np.array([[30.0, 20.0]]), np.array([[20.0, 10.0, 40.0, 30.0]])
+    figure = plot_objects.draw_objects(image, points, boxes, np.array([[30.0, 20.0]]), np.array([7]), np.array([12.3]))
+    (plot,) = figure.axes
+    assert plot.texts[0].get_text() == "7: 12.3 m/s"
+    assert plot.patches[0].get_bbox().bounds == (16.0, 6.0, 28.0, 28.0)
+    np.testing.assert_array_equal(plot.lines[0].get_xydata(), points)
+    png = np.frombuffer(plot_objects.encode(figure), np.uint8)
+    assert cv2.imdecode(png, cv2.IMREAD_COLOR).shape[1] == 1000
+    assert io.BytesIO(png.tobytes()).read(4) == b"\x89PNG"
+
+
+def test_nobody_is_a_picture_too():
+    none = np.zeros((0, 2))
+    figure = plot_objects.draw_objects(
+        np.zeros((20, 30), np.uint8), none, np.zeros((0, 4)), none, np.zeros(0, int), np.zeros(0)
+    )
+    assert not figure.axes[0].texts
+    assert len(plot_objects.draw_from_above(np.zeros((1, 3)), {}).axes) == 1
+
+
+def test_paths_from_above():
+    path = np.array([[0, 1.0, 0, 10.0, 5.0, 0, 0], [1, 1.5, 0, 10.0, 5.0, 0, 0]])
+    figure = plot_objects.draw_from_above(np.array([[0, 0, 0], [0, 0, 1.0]]), {3: path})
+    lines = [line.get_xydata() for line in figure.axes[0].lines]
+    np.testing.assert_array_equal(lines[1], path[:, [1, 3]])
+    assert "3" in [text.get_text() for text in figure.axes[0].texts]
