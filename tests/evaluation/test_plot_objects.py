@@ -27,12 +27,3 @@ def test_nobody_is_a_picture_too():
         np.zeros((20, 30), np.uint8), none, np.zeros((0, 4)), none, np.zeros(0, int), np.zeros(0)
     )
     assert not figure.axes[0].texts
-    assert len(plot_objects.draw_from_above(np.zeros((1, 3)), {}).axes) == 1
-
-
-def test_paths_from_above():
-    path = np.array([[0, 1.0, 0, 10.0, 5.0, 0, 0], [1, 1.5, 0, 10.0, 5.0, 0, 0]])
-    figure = plot_objects.draw_from_above(np.array([[0, 0, 0], [0, 0, 1.0]]), {3: path})
-    lines = [line.get_xydata() for line in figure.axes[0].lines]
-    np.testing.assert_array_equal(lines[1], path[:, [1, 3]])
-    assert "3" in [text.get_text() for text in figure.axes[0].texts]

@@ -8,11 +8,11 @@ import numpy as np
 import typer
 
 from jaxloc.cli import configuration, results, session, track_stereo_summary
+from jaxloc.cli.track import HEADER
 from jaxloc.data import DataError, StereoSequence, kitti
 from jaxloc.data.writing import RowWriter, write_file
 from jaxloc.evaluation import plot_objects
 
-HEADER = "frame,id,x,y,z,vx,vy,vz,var_x,var_y,var_z,u,v"
 _PICTURES = 8  # annotated frames of a run
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from jaxloc.cli import results
-from jaxloc.evaluation import plot, plot_objects, report
+from jaxloc.evaluation import plot, plot_tracks, report
 
 _WARM_UP = 3  # frames that compile
 
@@ -66,13 +66,8 @@ class Record:
     def page(self, metrics: dict[str, Any]) -> str:
         """The report."""
         places = np.array([np.asarray(step.odometry.pose.translation) for step in self.steps])
-        sections = [
-            report.Section(
-                "Seen from above",
-                "The camera's path and the tracks of what moves, in the frame of the first camera. Arrows: velocities.",
-                plot_objects.draw_from_above(places, self.paths()),
-            )
-        ]
+        text = "The camera's path and the tracks of what moves, in the frame of the first camera."
+        sections = [report.Section("Seen from above", text, plot_tracks.draw_tracks(*self._tracks(), camera=places))]
         text = "Moving points (dots), measured objects (boxes), and tracks with their speed."
         for index, picture in self.pictures:
             sections.append(report.Section(f"Frame {index}", text, picture, raster=True))
@@ -86,6 +81,15 @@ class Record:
         if self.interrupted:
             summary += " Interrupted: the report ends with the last frame that was processed."
         return report.render_report(self.title, sections, summary=summary)
+
+    def _tracks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Places, numbers and validity of tracks by frame, padded."""
+        room = max((len(step.tracks) for step in self.steps), default=0)
+        places, ids = np.zeros((len(self.steps), room, 3)), np.full((len(self.steps), room), -1)
+        for i, step in enumerate(self.steps):
+            for j, track in enumerate(step.tracks):
+                places[i, j], ids[i, j] = track.state[:3], track.label
+        return places, ids, ids >= 0
 
     def _table(self) -> report.Table:
         rows = []

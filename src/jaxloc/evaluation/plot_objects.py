@@ -1,4 +1,4 @@
-"""Pictures of moving objects: annotated frames, and the scene from above."""
+"""Annotated frames: moving points, measured objects, tracks."""
 
 import io
 from typing import TYPE_CHECKING, Any
@@ -50,33 +50,6 @@ def draw_objects(
         )
     plot.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     plot.set_axis_off()
-    return figure
-
-
-def draw_from_above(camera: Float[np.ndarray, "n 3"], paths: dict[int, Float[np.ndarray, "m 7"]]) -> "Figure":
-    """Tracks and the path of the camera, seen from above (x right, z forward).
-
-    Args:
-        camera: positions of the camera, m.
-        paths: by track number: frame, position and velocity.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
-    plot = figure.add_subplot()
-    plot.plot(camera[:, 0], camera[:, 2], color="black", label="camera")
-    for index, (label, path) in enumerate(sorted(paths.items())):
-        color = f"C{index % 10}"
-        plot.plot(path[:, 1], path[:, 3], ".-", color=color, markersize=3, linewidth=1)
-        plot.annotate(str(label), (path[-1, 1], path[-1, 3]), color=color, fontsize=8)
-        x, z, along_x, along_z = path[-1, [1, 3, 4, 6]]
-        plot.annotate(
-            "", (x + 0.3 * along_x, z + 0.3 * along_z), (x, z), arrowprops={"arrowstyle": "->", "color": color}
-        )
-    plot.set(xlabel="x, m", ylabel="z, m")
-    plot.set_aspect("equal", adjustable="datalim")
-    plot.legend()
-    plot.grid(alpha=0.3)
     return figure
 
 

@@ -301,8 +301,8 @@ def choose(mixture: Mixture, measurements: Any, evidence: Evidence, phd: GmPhd, 
     measurements = finite_or_zero(measurements)
     num, num_measured = evidence.pairs.shape
     parts = [evidence.missed, evidence.pairs.reshape(-1)]
-    births = isinstance(phd.model.birth, MeasuredBirth)
-    if births:
+    birth = phd.model.birth
+    if isinstance(birth, MeasuredBirth):
         parts.append(evidence.born)
     weights = jnp.concatenate(parts)
     candidates = 2 * phd.capacity if phd.candidates is None else phd.candidates
@@ -316,10 +316,10 @@ def choose(mixture: Mixture, measurements: Any, evidence: Evidence, phd: GmPhd, 
     means = _select(missed, old.means, means)
     covariances = _select(missed, old.covariances, matmul(roots, roots.mT))
     labels = old.labels
-    if births:
+    if isinstance(birth, MeasuredBirth):
         new = places >= num + num * num_measured
         columns = jnp.where(new, places - num - num * num_measured, 0)
-        seeds = jax.vmap(lambda j: phd.model.birth.seed(jax.tree.map(lambda leaf: leaf[j], measurements)))(columns)
+        seeds = jax.vmap(lambda j: birth.seed(jax.tree.map(lambda leaf: leaf[j], measurements)))(columns)
         means = _select(new, seeds.mean, means)
         covariances = _select(new, seeds.covariance, covariances)
         labels = jnp.where(new, first_label + columns.astype(jnp.int32), labels)
