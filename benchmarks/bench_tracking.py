@@ -33,7 +33,7 @@ def metrics(smoke: bool) -> Iterator[Metric]:
     yield from _accuracy(*((2, 5, ("phd.clutter10",)) if smoke else (40, 100, _CASES)))
     yield from _speed(2 if smoke else 100, 1 if smoke else 5)
     yield from _crowd(1 if smoke else 5)
-    yield from _conflict((25,) if smoke else (25, 50, 100, 200, 400, 800), 1 if smoke else 3)
+    yield from _conflict((25,) if smoke else (25, 50, 100, 200, 400, 800, 1600, 3200), 1 if smoke else 3)
     yield from _sets(10 if smoke else 1000, 1 if smoke else 5)
     yield from _learned(*((2, 3, 2) if smoke else (64, 15, 30)))
 
@@ -53,10 +53,10 @@ def model_of(scenario: TargetScenario, filt: Filter) -> TargetModel:
     )
 
 
-def linear(rate: float) -> tuple[LinearScenario, Copied]:
+def linear(rate: float, **room: int) -> tuple[LinearScenario, Copied]:
     """The linear scenario, and its filter."""
     scenario = LinearScenario(clutter_rate=rate)
-    return scenario, Copied(model_of(scenario, KalmanFilter(scenario.motion, scenario.sensor)), gate=_GATE)
+    return scenario, Copied(model_of(scenario, KalmanFilter(scenario.motion, scenario.sensor)), gate=_GATE, **room)
 
 
 def nobody(scenario: TargetScenario) -> Mixture:
@@ -106,7 +106,7 @@ def _pass(tracker: Any, state: Any, measurements: Any, valid: Any) -> Any:
 
 
 def _speed(peer_scans: int, repeats: int) -> Iterator[Metric]:
-    scenario, phd = linear(60.0)
+    scenario, phd = linear(60.0, capacity=64, candidates=100)
     drive = simulate_targets(scenario, key=jax.random.key(0))
     for name, tracker in (("phd", phd), ("cphd", GmCphd(phd))):
         arguments = (tracker, tracker.init(nobody(scenario)), drive.measurements, drive.valid)
@@ -115,6 +115,8 @@ def _speed(peer_scans: int, repeats: int) -> Iterator[Metric]:
         yield Metric(f"tracking.{name}.scans_a_second", scenario.num_scans / spent.wall, "scans/s", "higher", TIME)
         yield Metric(f"tracking.{name}.compile", took.wall, "s", "lower", TIME)
         if name == "phd":
+            lost = program(*arguments)[1].infos.crowded.sum()
+            yield Metric("tracking.phd.crowded", int(lost), "components without room", "lower", ACCURACY)
             ours = Timing(spent.wall / scenario.num_scans, spent.cpu / scenario.num_scans)
     scans = [np.asarray(z[v], float) for z, v in zip(drive.measurements, drive.valid, strict=True)][:peer_scans]
     _, took = timed(lambda: stone_soup.run(scenario, scans))

@@ -90,11 +90,27 @@ class Pipeline:
             )
 
 
+class Objects:
+    """Finds nothing that moves."""
+
+    class Config(eqx.Module):
+        odometry: Any = Config()
+
+    def __init__(self, odometry: Pipeline):
+        self.odometry = odometry
+
+    def steps(self, frames: Any, rig: Any, config: Any, *, poses: Any = None) -> Iterator[Any]:
+        del poses
+        none = {"points": np.zeros((0, 2)), "objects": np.zeros((0, 6)), "boxes": np.zeros((0, 4)), "tracks": ()}
+        for index, step in enumerate(self.odometry.steps(frames, rig, config.odometry)):
+            yield types.SimpleNamespace(index=index, odometry=step, timings={"filter": 0.01}, count=0.0, **none)
+
+
 @pytest.fixture
 def pipeline(monkeypatch):
     stand_in = Pipeline()
     module = types.ModuleType("jaxloc.pipelines")
-    module.odometry = stand_in
+    module.odometry, module.datmo = stand_in, Objects(stand_in)
     monkeypatch.setitem(sys.modules, "jaxloc.pipelines", module)
     return stand_in
 
@@ -193,9 +209,11 @@ def test_bad_options_are_refused(pipeline, sequence, tmp_path, capsys, text, mat
 def test_the_demo_reports_on_a_synthetic_street(pipeline, tmp_path):
     out = tmp_path / "demo"
     assert run(["demo", "--frames", "6", "--seed", "3", "--out", str(out)]) == 0
-    assert sorted(path.name for path in out.iterdir()) == FILES
+    assert sorted(path.name for path in out.iterdir()) == sorted([*FILES, "moving_objects"])
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["frames"] == 6 and metrics["end_drift_percent"] < 5.0
+    objects = json.loads((out / "moving_objects" / "metrics.json").read_text())
+    assert objects["frames"] == 6 and objects["tracks"] == 0
     assert yaml.safe_load((out / "config.yaml").read_text())["seed"] == 3
 
 
