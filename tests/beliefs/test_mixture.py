@@ -90,3 +90,20 @@ def test_gradient_of_intensity_is_that_of_finite_differences(parts):
         step = step[:, None] * jnp.array([[1.0, 0.0]])
         numeric = (value(weights, means + step) - value(weights, means - step)) / 2e-6
         assert float(by_means[k, 0]) == pytest.approx(float(numeric), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("weights", "covariance", "match"),
+    [
+        ([0.5, -0.1], [[1.0, 0.0], [0.0, 1.0]], "never negative; got -0.1"),
+        ([0.5, np.nan], [[1.0, 0.0], [0.0, 1.0]], "not finite"),
+        ([0.5, 0.1], [[1.0, 2.0], [2.0, 1.0]], "Covariance 1 .*negative eigenvalue -1"),
+    ],
+)
+def test_numbers_without_sense_are_refused_at_the_edge(weights, covariance, match):
+    spreads = jnp.stack([jnp.eye(2), jnp.array(covariance)])
+    bad = jl.beliefs.Mixture(jnp.array(weights), jnp.zeros((2, 2)), spreads)
+    with pytest.raises(ValueError, match=match):
+        bad.check()
+    assert jax.jit(lambda mixture: mixture.check().mass)(bad).shape == ()
+    assert jl.beliefs.Mixture.empty(0, jnp.zeros(2)).check().capacity == 0

@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -14,6 +15,7 @@ from jaxloc.poses import is_flat, local, retract, tangent_dimension
 from jaxloc.poses.group import matmul
 
 _MEAN_STEPS = 3
+_ROUNDING = 1e-5  # of a covariance, relative to its largest eigenvalue
 
 
 class Mixture(eqx.Module):
@@ -59,6 +61,26 @@ class Mixture(eqx.Module):
         means = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (capacity, *leaf.shape)), example)
         covariances = jnp.broadcast_to(jnp.eye(size, dtype=dtype), (capacity, size, size))
         return Mixture(jnp.zeros(capacity, dtype), means, covariances)
+
+    def check(self) -> "Mixture":
+        """The mixture, if its numbers can be used; for the host, nothing is checked inside a transformation.
+
+        Raises:
+            ValueError: if a weight is negative, a number is not finite, or a covariance has a negative eigenvalue.
+        """
+        leaves = [leaf for leaf in jax.tree.leaves(self) if eqx.is_inexact_array(leaf)]
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return self
+        if not all(np.isfinite(leaf).all() for leaf in leaves):
+            raise ValueError("A mixture holds numbers that are not finite.")
+        if (np.asarray(self.weights) < 0.0).any():
+            raise ValueError(f"Weights of a mixture are never negative; got {np.asarray(self.weights).min():.3g}.")
+        values = np.linalg.eigvalsh(np.asarray(self.covariances, np.float64))
+        negative = values.min(axis=-1, initial=np.inf) < -_ROUNDING * np.abs(values).max(axis=-1, initial=0.0)
+        if negative.any():
+            place = int(np.argmax(negative))
+            raise ValueError(f"Covariance {place} of a mixture has the negative eigenvalue {values[place].min():.3g}.")
+        return self
 
     @property
     def capacity(self) -> int:

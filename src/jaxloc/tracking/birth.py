@@ -46,6 +46,10 @@ class StaticBirth(Birth):
 
     intensity: Mixture
 
+    def __check_init__(self):
+        if isinstance(self.intensity, Mixture):  # else a prefix tree, such as in_axes
+            self.intensity.check()
+
     def mixture(self, example: Any) -> Mixture:
         """The same at every scan."""
         del example

@@ -112,7 +112,7 @@ class GmPhd(Tracker):
         if prior.capacity > self.capacity:
             raise ValueError(f"GmPhd keeps {self.capacity} components; the prior has {prior.capacity}. Reduce it.")
         one = jnp.ones((), prior.weights.dtype)
-        return PhdState(prior.padded(self.capacity), jnp.zeros((), jnp.int32), jnp.max(prior.labels) + 1, one)
+        return PhdState(prior.check().padded(self.capacity), jnp.zeros((), jnp.int32), jnp.max(prior.labels) + 1, one)
 
     def predict(self, state: PhdState, control: Any, *, key: Key[Array, ""] | None = None) -> PhdState:
         """Survivors move, others appear."""

@@ -175,7 +175,7 @@ def open_tracks(model: TargetModel, capacity: int, prior: Mixture | None, life: 
         raise ValueError("Nothing says what a state looks like; give Mixture.empty(1, example) with any state.")
     if prior.capacity > capacity:
         raise ValueError(f"The prior has {prior.capacity} components, but there is room for {capacity} tracks.")
-    padded = prior.padded(capacity)
+    padded = prior.check().padded(capacity)
     existence = jnp.minimum(padded.weights, 1.0)
     there = existence > 0.0
     labels = jnp.where(there, jnp.cumsum(there, dtype=jnp.int32) - 1, NO_LABEL)
