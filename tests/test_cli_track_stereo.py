@@ -6,6 +6,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from jaxloc.cli.commands import app
@@ -52,6 +53,7 @@ def test_rows_pictures_and_report(recording, tmp_path):
     assert metrics["frames"] == FRAMES and metrics["track_frames"] == len(rows)
     assert {"detect", "flow", "group", "filter"} <= set(metrics["stages_ms"])
     assert len(list((out / "pictures").glob("*.png"))) == 8
+    assert yaml.safe_load((out / "config.yaml").read_text())["command"] == "track"
     assert "Seen from above" in (out / "report.html").read_text()
     assert len((out / "trajectory.txt").read_text().splitlines()) == FRAMES
 

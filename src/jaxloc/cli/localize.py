@@ -40,10 +40,7 @@ def run_log(
     Raises:
         DataError: when any input is bad; nothing is written then.
     """
-    session.check_output(out)
-    results.check_extras()
-    configuration.load_yaml()
-    session.keep_compilations()
+    results.prepare(out)
     if start is not None and not np.isfinite(start).all():
         raise DataError("--start", "must be three finite numbers")
     grid = _check_map(map_path)

@@ -67,10 +67,7 @@ def run_demo(out: Path, config_path: Path | None, *, num_frames: int, seed: int)
 
 def _prepare(out: Path, config_path: Path | None) -> Any:
     """Checks all that can fail before the run: the output folder, the options, the libraries for the report."""
-    session.check_output(out)
-    results.check_extras()
-    configuration.load_yaml()
-    session.keep_compilations()
+    results.prepare(out)
     from jaxloc.pipelines import odometry
 
     default = odometry.Config()

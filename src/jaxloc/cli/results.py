@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import jaxloc
-from jaxloc.cli import configuration
+from jaxloc.cli import configuration, session
 from jaxloc.data.writing import write_file
 from jaxloc.evaluation import report
 
@@ -36,6 +36,19 @@ def check_extras() -> None:
         import rich  # noqa: F401
     except ImportError as error:
         raise ImportError(f'reports need {error.name}: pip install "jaxloc[cli]"') from error
+
+
+def prepare(out: Path) -> None:
+    """Checks all that can fail before any input is read: the output folder, and the libraries for the results.
+
+    Raises:
+        DataError: when the folder cannot be used.
+        ImportError: when a library is not there.
+    """
+    session.check_output(out)
+    check_extras()
+    configuration.load_yaml()
+    session.keep_compilations()
 
 
 def write(record: Record, config: Any, out: Path, inputs: dict[str, Any]) -> dict[str, Any]:

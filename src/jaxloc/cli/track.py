@@ -55,10 +55,7 @@ def run_detections(inputs: Inputs, out: Path, config_path: Path | None) -> int:
     Raises:
         DataError: when any input is bad; nothing is written then.
     """
-    session.check_output(out)
-    results.check_extras()
-    configuration.load_yaml()
-    session.keep_compilations()
+    results.prepare(out)
     form = _form(inputs)
     found, truth, poses = _read_kitti(inputs) if form == "kitti" else _read_mot(inputs)
     if not found.valid.any():

@@ -37,7 +37,7 @@ def run_recording(folder: Path, poses: Path | None, out: Path, config_path: Path
         sequence.verify(progress)
     if poses is not None and sequence.truth is None:
         raise DataError(poses, "holds no poses")
-    inputs = {"sequence": str(folder), "poses": None if poses is None else str(poses)}
+    inputs = {"command": "track", "sequence": str(folder), "poses": None if poses is None else str(poses)}
     return run_sequence(
         sequence, config, out, inputs, title=f"Moving objects: {sequence.name}", known=poses is not None
     )
@@ -45,10 +45,7 @@ def run_recording(folder: Path, poses: Path | None, out: Path, config_path: Path
 
 def prepare(out: Path, config_path: Path | None) -> Any:
     """Checks all that can fail before the run: the output folder, the options, the libraries for the report."""
-    session.check_output(out)
-    results.check_extras()
-    configuration.load_yaml()
-    session.keep_compilations()
+    results.prepare(out)
     from jaxloc.pipelines import datmo
 
     default = datmo.Config()
