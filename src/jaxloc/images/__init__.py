@@ -9,21 +9,32 @@ from jaxloc.images import (
     interpolation,
     keypoints,
     match,
+    matrix_exponential,
+    normalize,
     opencv,
     patches,
     pyramid,
     select,
+    spectrum,
     subpixel,
+    warps,
 )
 from jaxloc.images.interpolation import Bicubic, Bilinear
 from jaxloc.images.keypoints import Descriptors, Keypoints, Matches
+from jaxloc.images.warps import Affine, Euclidean, Homography, Similarity, Translation, Warp
 
 __all__ = [
+    "Affine",
     "Bicubic",
     "Bilinear",
     "Descriptors",
+    "Euclidean",
+    "Homography",
     "Keypoints",
     "Matches",
+    "Similarity",
+    "Translation",
+    "Warp",
     "corners",
     "describe",
     "detect",
@@ -32,9 +43,13 @@ __all__ = [
     "interpolation",
     "keypoints",
     "match",
+    "matrix_exponential",
+    "normalize",
     "opencv",
     "patches",
     "pyramid",
     "select",
+    "spectrum",
     "subpixel",
+    "warps",
 ]

@@ -4,7 +4,7 @@ from abc import abstractmethod
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 
 class Sampled(eqx.Module):
@@ -92,20 +92,30 @@ def sample(
         >>> sampled.values.tolist(), sampled.inside.tolist()
         ([1.5, 0.0], [True, False])
     """
-    method = Bilinear() if method is None else method
-    height, width = image.shape[:2]
-    inside = inside_image(uv, (height, width))
-    safe = jnp.where(inside[:, None], uv, 0.0)
-    columns, weights_u = _neighbors(safe[:, 0], width, method)
-    rows, weights_v = _neighbors(safe[:, 1], height, method)
-    flat = image.reshape(height * width, *image.shape[2:])
-    values = jnp.zeros((uv.shape[0], *image.shape[2:]), dtype=image.dtype)
-    for row, weight_v in zip(rows, weights_v, strict=True):
-        for column, weight_u in zip(columns, weights_u, strict=True):
-            weight = jnp.where(inside, weight_v * weight_u, 0.0).astype(image.dtype)
-            picked = flat.at[row * width + column].get(mode="promise_in_bounds")
-            values = values + weight.reshape(weight.shape + (1,) * (image.ndim - 2)) * picked
+    values, inside = sample_components(image, uv[:, 0], uv[:, 1], method=Bilinear() if method is None else method)
     return Sampled(values, inside)
+
+
+def sample_components(
+    image: Float[Array, "h w *c"], u: Float[Array, " n"], v: Float[Array, " n"], *, method: AbstractInterpolation
+) -> tuple[Float[Array, "n *c"], Bool[Array, " n"]]:
+    """`sample` on component arrays: values and which points lie inside. Inner loops keep coordinates apart."""
+    height, width = image.shape[:2]
+    inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    columns, weights_u = _neighbors(jnp.where(inside, u, 0.0), width, method)
+    rows, weights_v = _neighbors(jnp.where(inside, v, 0.0), height, method)
+    flat, behind = image.reshape(height * width, *image.shape[2:]), (1,) * (image.ndim - 2)
+
+    def along(row: Int[Array, " n"]) -> Float[Array, "n *c"]:
+        picked = [flat.at[row * width + column].get(mode="promise_in_bounds") for column in columns]
+        return sum(_behind(weight, image, behind) * part for weight, part in zip(weights_u, picked, strict=True))
+
+    values = sum(_behind(weight, image, behind) * along(row) for weight, row in zip(weights_v, rows, strict=True))
+    return jnp.where(inside.reshape(inside.shape + behind), values, 0.0), inside
+
+
+def _behind(weight: Float[Array, " n"], image: Array, axes: tuple[int, ...]) -> Float[Array, "n *one"]:
+    return weight.astype(image.dtype).reshape(weight.shape + axes)
 
 
 def inside_image(uv: Float[Array, "n 2"], shape: tuple[int, int]) -> Bool[Array, " n"]:
@@ -125,5 +135,7 @@ def _neighbors(coordinate: Float[Array, " n"], size: int, method: AbstractInterp
     # The last cell takes its closed end, so that a coordinate on the far border still has a gradient.
     base = jnp.clip(jnp.floor(coordinate).astype(jnp.int32), 0, max(size - 2, 0))
     fraction = coordinate - base.astype(coordinate.dtype)
-    indices = [jnp.clip(base + method.first + tap, 0, size - 1) for tap in range(method.taps)]
+    # Two neighbors of a cell are never off the image, if it has two pixels.
+    near = method.first == 0 and method.taps <= min(size, 2)
+    indices = [base + tap if near else jnp.clip(base + method.first + tap, 0, size - 1) for tap in range(method.taps)]
     return indices, method.weights(fraction)
