@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _ROOMS = (
+    "alignment",
     "beliefs",
     "data",
     "evaluation",
@@ -29,6 +30,7 @@ __all__ = [*_ROOMS, "__version__"]
 
 if TYPE_CHECKING:
     from jaxloc import (
+        alignment,
         beliefs,
         data,
         evaluation,

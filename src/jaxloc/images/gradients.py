@@ -105,7 +105,8 @@ def smooth(
     if radius is None:
         if not isinstance(sigma, float | int):
             raise ValueError("smooth: an array sigma needs a static radius, for example radius=6.")
-        radius = max(1, math.ceil(3.0 * sigma))
+        # A border is reflected once: the kernel reaches no further than the image.
+        radius = max(1, min(math.ceil(3.0 * sigma), min(image.shape) - 1))
     offsets = jnp.arange(-radius, radius + 1, dtype=image.dtype)
     weights = jnp.exp(-0.5 * (offsets / jnp.asarray(sigma, image.dtype)) ** 2)
     weights = weights / weights.sum()

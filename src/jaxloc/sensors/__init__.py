@@ -12,6 +12,7 @@ from jaxloc.sensors import (
     odometer,
     ranging,
     rig,
+    textured_plane,
 )
 from jaxloc.sensors.camera import Pinhole
 from jaxloc.sensors.ceiling import CeilingMosaic, CeilingSensor
@@ -24,6 +25,7 @@ from jaxloc.sensors.moving_objects import MovingObject, MovingObjectSensor
 from jaxloc.sensors.odometer import DifferentialDrive, OdometryMotion
 from jaxloc.sensors.ranging import Range, RangeSensor, RangingMotion, RangingState
 from jaxloc.sensors.rig import StereoRig
+from jaxloc.sensors.textured_plane import Predicted, TexturedPlane
 
 __all__ = [
     "BeamModel",
@@ -44,6 +46,7 @@ __all__ = [
     "OccupancyMap",
     "OdometryMotion",
     "Pinhole",
+    "Predicted",
     "Range",
     "RangeBearing",
     "RangeBearingSensor",
@@ -51,6 +54,7 @@ __all__ = [
     "RangingMotion",
     "RangingState",
     "StereoRig",
+    "TexturedPlane",
     "camera",
     "ceiling",
     "distortion",
@@ -62,4 +66,5 @@ __all__ = [
     "odometer",
     "ranging",
     "rig",
+    "textured_plane",
 ]

@@ -1,0 +1,44 @@
+"""Exhaustive search for a template: every place is scored, the best is refined between pixels.
+
+Correlation is brute-force association: it needs no start, and as it blurs finding and refining, all peaks can be had,
+and the best comes with its sharpness [K-24, K-26, K-93].
+"""
+
+from jaxloc.alignment.correlation.classify import Classification, classify
+from jaxloc.alignment.correlation.matched_filter import ColoredNoise, Noise, Response, WhiteNoise, respond, threshold
+from jaxloc.alignment.correlation.peaks import Parabola, Peaks, find_peaks, fit_parabola
+from jaxloc.alignment.correlation.scores import (
+    Correlator,
+    Direct,
+    Fourier,
+    NormalizedCorrelation,
+    Score,
+    SumOfSquares,
+    ZeroMeanCorrelation,
+)
+from jaxloc.alignment.correlation.search import Window, score_map, search
+
+__all__ = [
+    "Classification",
+    "ColoredNoise",
+    "Correlator",
+    "Direct",
+    "Fourier",
+    "Noise",
+    "NormalizedCorrelation",
+    "Parabola",
+    "Peaks",
+    "Response",
+    "Score",
+    "SumOfSquares",
+    "WhiteNoise",
+    "Window",
+    "ZeroMeanCorrelation",
+    "classify",
+    "find_peaks",
+    "fit_parabola",
+    "respond",
+    "score_map",
+    "search",
+    "threshold",
+]

@@ -1,0 +1,70 @@
+"""Which of several templates an image shows."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Num
+
+from jaxloc.alignment.correlation.peaks import find_peaks
+from jaxloc.alignment.correlation.scores import Score, ZeroMeanCorrelation
+from jaxloc.alignment.correlation.search import score_map
+from jaxloc.images.warps import Translation
+
+
+class Classification(eqx.Module):
+    """Which template of a bank is seen.
+
+    Attributes:
+        label: its number.
+        translation: where, template to image.
+        scores: the best correlation of each template.
+        ok: True if the best stands out: its distance from perfect is at most 0.8 times that of the next template.
+    """
+
+    label: Int[Array, ""]
+    translation: Translation
+    scores: Float[Array, " k"]
+    ok: Bool[Array, ""]
+
+
+@eqx.filter_jit
+def classify(
+    image: Num[Array, "h w"] | Any, templates: Num[Array, "k m n"] | Any, *, score: Score = ZeroMeanCorrelation()
+) -> Classification:
+    """Tells which template of a bank an image shows, and where: the one of the highest correlation.
+
+    Args:
+        image: grey levels.
+        templates: k grey pictures of one size.
+        score: a correlation.
+
+    Returns:
+        Label, place, scores of all templates, and whether the best stands out.
+
+    Raises:
+        ValueError: the score is a distance, or templates are larger than the image.
+
+    References:
+        Pallet type by template correlation [K-75].
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> bank = jax.random.uniform(jax.random.key(0), (3, 8, 8))
+        >>> seen = classify(jnp.zeros((20, 20)).at[5:13, 3:11].set(bank[2]), bank)
+        >>> int(seen.label), seen.translation.translation.round().tolist(), bool(seen.ok)
+        (2, [3.0, 5.0], True)
+    """
+    if score.best_is_least:
+        raise ValueError(f"classify: {type(score).__name__} depends on contrast; use a correlation.")
+
+    def best(template: Array) -> tuple[Array, Array]:
+        peaks = find_peaks(score_map(image, template, score=score), count=1)
+        return peaks.scores[0], peaks.uv[0]
+
+    scores, uv = jax.vmap(best)(jnp.asarray(templates))
+    label = jnp.argmax(scores)
+    others = jnp.max(jnp.where(jnp.arange(scores.shape[0]) == label, -1.0, scores))
+    ok = (scores[label] > 0) & (1.0 - scores[label] <= 0.8 * (1.0 - others))
+    return Classification(label, Translation(uv[label]), scores, ok)

@@ -1,0 +1,178 @@
+"""A whole-pixel peak refined by least squares: where, how surely, and with the derivatives of the solution."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from jaxloc.alignment.correlation.scores import NormalizedCorrelation, Pair, Score, SumOfSquares
+from jaxloc.images.gradients import central_difference
+from jaxloc.images.interpolation import Bicubic
+from jaxloc.images.patches import extract
+from jaxloc.poses.group import matmul
+
+_LEAST_SIGMA = 0.01  # what interpolation errs by without noise, px
+STEPS = 4
+
+
+class Shift(eqx.Module):
+    """A refined shift.
+
+    Attributes:
+        uv: of the template on the image, px.
+        covariance: px^2.
+        information: its inverse, zero where not regular.
+        regular: True if the template's texture determines both directions.
+        settled: True if the refinement ended near the peak.
+    """
+
+    uv: Float[Array, "2"]
+    covariance: Float[Array, "2 2"]
+    information: Float[Array, "2 2"]
+    regular: Bool[Array, ""]
+    settled: Bool[Array, ""]
+
+
+class _Model(eqx.Module):
+    """The template's linear model of a patch: brightness (what the score is blind to), then both slopes."""
+
+    rows: Float[Array, "k n"]
+    weight: Float[Array, " n"]
+    base: Float[Array, " n"]
+    inverse: Float[Array, "k k"]
+    regular: Bool[Array, ""]
+    fixed_gain: bool = eqx.field(static=True)
+    shape: tuple[int, int] = eqx.field(static=True)
+
+    def regress(self, patch: Float[Array, " n"]) -> tuple[Array, Array, Array]:
+        """Step of the shift, gain, and weighted sum of squares that is left."""
+        target = patch - self.base
+        found = matmul(self.inverse, matmul(self.rows, self.weight * target))
+        left = target - matmul(self.rows.T, found)
+        gain = jnp.ones((), patch.dtype) if self.fixed_gain else found[0]
+        step = -found[-2:] / jnp.maximum(gain, 0.05)
+        return step, gain, jnp.sum(self.weight * left * left)
+
+
+def refine_shift(pair: Pair, score: Score, peak: Float[Array, "2"], start: Float[Array, "2"], sigma: Any) -> Shift:
+    """Minimizes ``sum (I(x + t) - g T(x) - b)^2`` near a peak of the score, with the brightness that the score knows.
+
+    Gauss-Newton by the template's slopes (inverse composition), then one Newton step that carries the derivatives of
+    the solution. The covariance is ``sigma^2 / g^2 H^-1`` with H the slopes' Gram matrix, brightness projected out,
+    less what interpolation takes off the noise.
+
+    Args:
+        pair: image and template.
+        score: `SumOfSquares` knows no brightness, `NormalizedCorrelation` a gain, `ZeroMeanCorrelation` gain and bias.
+        peak: the best whole shift.
+        start: the top of the parabola there.
+        sigma: the image's noise, or None to take it from what is left.
+
+    Returns:
+        The shift, its covariance and trust; the start where the template is flat.
+
+    References:
+        Baker and Matthews, "Lucas-Kanade 20 years on", 2004, sections 3.2 and 4.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jaxloc.alignment.correlation import Direct, SumOfSquares
+        >>> u, v = jnp.meshgrid(jnp.arange(40.0), jnp.arange(40.0))
+        >>> scene = lambda u, v: 50 * jnp.sin(0.4 * u) * jnp.cos(0.3 * v)
+        >>> pair = Pair(scene(u, v), scene(u + 9.7, v + 8.2)[:20, :20], None, Direct())
+        >>> peak = jnp.array([10.0, 8.0])
+        >>> [round(x, 1) for x in refine_shift(pair, SumOfSquares(), peak, peak, None).uv.tolist()]
+        [9.7, 8.2]
+    """
+    model, frozen = _model(pair, score), lax.stop_gradient(pair)
+    frozen_model, peak, start = lax.stop_gradient((model, peak, start))
+
+    def advance(_: Any, uv: Array) -> Array:
+        return jnp.clip(uv + frozen_model.regress(_patch(frozen, uv))[0], peak - 1.0, peak + 1.0)
+
+    uv = lax.fori_loop(0, STEPS, advance, start)
+    slope = jax.jacfwd(lambda at: frozen_model.regress(_patch(frozen, at))[0])(uv)
+    determinant = slope[0, 0] * slope[1, 1] - slope[0, 1] * slope[1, 0]
+    steep = (determinant > 0.1) & (slope[0, 0] < 0)
+    slope = jnp.where(steep, slope, -jnp.eye(2, dtype=slope.dtype))
+    step, gain, squares = model.regress(_patch(pair, uv))
+    inverse = lax.stop_gradient(-jnp.linalg.inv(slope))
+    step = matmul(inverse, step)
+    regular = model.regular & (gain > 0)
+    settled = steep & jnp.all(jnp.abs(step) < 0.1) & jnp.all(jnp.abs(uv - peak) < 1.0)
+    variance = _variance(model, uv, squares, sigma) / jnp.where(regular, jnp.maximum(gain, 0.05), 1.0) ** 2
+    covariance, information = _spread(model, uv, inverse, jnp.where(regular, variance, 0.0))
+    covariance = jnp.where(regular, covariance, jnp.eye(2, dtype=step.dtype))
+    information = jnp.where(regular, information, 0.0)
+    return Shift(jnp.where(regular & settled, uv + step, start), covariance, information, regular, settled)
+
+
+def _patch(pair: Pair, uv: Float[Array, "2"]) -> Float[Array, " n"]:
+    rows, columns = pair.template.shape
+    middle = 0.5 * jnp.array([columns - 1, rows - 1], dtype=uv.dtype)
+    last = jnp.array([m - n for m, n in zip(pair.image.shape, (rows, columns), strict=True)][::-1], dtype=uv.dtype)
+    inside = jnp.clip(uv, jnp.zeros_like(last), last)
+    return extract(pair.image, (inside + middle)[None], size=(rows, columns), method=Bicubic()).values.reshape(-1)
+
+
+def _model(pair: Pair, score: Score) -> _Model:
+    template = pair.template
+    slope = central_difference(template)
+    # Differences across the border see only one side.
+    inner = jnp.pad(jnp.ones(tuple(side - 2 for side in template.shape), template.dtype), 1)
+    weight = (inner if pair.mask is None else inner * pair.mask).reshape(-1)
+    flat, one = template.reshape(-1), jnp.ones_like(template).reshape(-1)
+    slopes = [slope.right.reshape(-1), slope.down.reshape(-1)]
+    fixed = isinstance(score, SumOfSquares)
+    if fixed:
+        columns = slopes
+    elif isinstance(score, NormalizedCorrelation):
+        columns = [flat, *slopes]
+    else:
+        mean = jnp.sum(weight * flat) / jnp.maximum(jnp.sum(weight), 1.0)
+        columns = [flat - mean, one, *slopes]
+    rows = jnp.stack(columns)
+    inverse, regular = _inverse(matmul(rows * weight[None], rows.T), jnp.sum(weight) * jnp.max(jnp.abs(flat)) ** 2)
+    return _Model(rows, weight, flat if fixed else jnp.zeros_like(flat), inverse, regular, fixed, template.shape)
+
+
+def _inverse(gram: Float[Array, "k k"], energy: Float[Array, ""]) -> tuple[Float[Array, "k k"], Bool[Array, ""]]:
+    """Inverse of the normal matrix, scaled to a unit diagonal, and whether it has one."""
+    eye, diagonal = jnp.eye(gram.shape[0], dtype=gram.dtype), jnp.diagonal(gram)
+    floor = (64.0 * float(jnp.finfo(gram.dtype).eps)) ** 2 * energy
+    textured = jnp.all(diagonal > floor)
+    scale = jnp.where(textured, 1.0 / jnp.sqrt(jnp.where(textured, diagonal, 1.0)), 1.0)
+    scaled = jnp.where(textured, gram * scale[:, None] * scale[None, :], eye)
+    regular = textured & (jnp.linalg.eigvalsh(lax.stop_gradient(scaled))[0] > 1e-3)
+    inverse = jnp.linalg.inv(jnp.where(regular, scaled, eye)) * scale[:, None] * scale[None, :]
+    return jnp.where(regular, inverse, eye), regular
+
+
+def _variance(model: _Model, uv: Array, squares: Array, sigma: Any) -> Array:
+    """Of the image's noise; interpolation lets through a part of it only."""
+    if sigma is not None:
+        return sigma**2
+    freedom = jnp.maximum(jnp.sum(model.weight) - model.rows.shape[0], 1.0)
+    return squares / (freedom * jnp.prod(sum(w * w for w in Bicubic().weights(uv - jnp.floor(uv)))))
+
+
+def _spread(model: _Model, uv: Array, slope: Array, variance: Array) -> tuple[Array, Array]:
+    """Covariance, of independent noise carried through interpolation, regression and Newton step, and information."""
+    weights = Bicubic().weights(uv - jnp.floor(uv))
+    estimator = matmul(slope, matmul(model.inverse[-2:], model.rows * model.weight[None])).reshape(2, *model.shape)
+    for axis, coordinate in ((1, 1), (2, 0)):
+        estimator = _transpose_shift(estimator, [w[coordinate] for w in weights], axis)
+    estimator = estimator.reshape(2, -1)
+    covariance = variance * matmul(estimator, estimator.T) + _LEAST_SIGMA**2 * jnp.eye(2, dtype=uv.dtype)
+    covariance = lax.stop_gradient(covariance)
+    return covariance, jnp.linalg.inv(covariance)
+
+
+def _transpose_shift(rows: Float[Array, "2 m n"], weights: list[Float[Array, ""]], axis: int) -> Float[Array, "2 p q"]:
+    """Weights of the image's pixels, given those of the pixels interpolated from them along an axis."""
+    extra = len(weights) - 1
+    pads = [[(extra - k, k) if a == axis else (0, 0) for a in range(3)] for k in range(len(weights))]
+    return sum(weight * jnp.pad(rows, pad) for weight, pad in zip(reversed(weights), pads, strict=True))

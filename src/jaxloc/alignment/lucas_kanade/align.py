@@ -1,0 +1,130 @@
+"""Lucas and Kanade's alignment of a template with an image, under any warp."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Num
+
+from jaxloc.alignment.lucas_kanade.conclusion import Evidence, conclude, follow_root
+from jaxloc.alignment.lucas_kanade.descend import Descended, Limits, descend
+from jaxloc.alignment.lucas_kanade.equations import zero_brightness
+from jaxloc.alignment.lucas_kanade.level import Frame, Level
+from jaxloc.alignment.lucas_kanade.settings import LucasKanade
+from jaxloc.images.normalize import as_grey
+from jaxloc.images.warps import Warp
+from jaxloc.solvers import Estimate
+
+
+def align(
+    image: Num[Array, "h w"] | Any,
+    template: Num[Array, "p q"] | Any,
+    warp: type[Warp],
+    initial: Warp | None = None,
+    *,
+    method: LucasKanade = LucasKanade(),
+    weights: Num[Array, "p q"] | Bool[Array, "p q"] | None = None,
+    sigma: Any = None,
+) -> Estimate:
+    """Finds the warp W under which the image looks like the template: ``image(W(x)) ~ gain template(x) + bias``.
+
+    Minimizes ``sum_x w(x) rho((image(W(x)) - gain template(x) - bias) / sigma)`` over the warp, gain and bias being
+    eliminated in closed form, from coarse to fine. The value has the derivatives of the solution with respect to image,
+    template and weights (implicit function theorem), in forward and reverse mode.
+
+    Args:
+        image: grey levels, bytes or numbers; nan where there is no picture.
+        template: grey levels; nan where it does not count.
+        warp: its class: `Translation`, `Euclidean`, `Similarity`, `Affine` or `Homography`.
+        initial: where to start, a warp of any class from template pixels to image pixels; the identity by default.
+        method: formulation, descent, brightness, scales, kernel, limits.
+        weights: of the template's pixels, or a mask.
+        sigma: standard deviation of the image's noise, grey levels; measured from the residual if not given.
+
+    Returns:
+        Estimate of the warp, with the covariance of its tangent (``W @ exp(d)``, pixels). It holds the noise of both
+        pictures, as far as interpolation lets it through; it knows nothing of a warp that is too simple for the scene.
+        ``ok`` is False when the texture leaves directions undetermined (a flat template, a single edge), when the
+        search did not settle, or when the result contradicts the model: too little of the template on the image, too
+        little correlation, a template folded over. The value is finite in any case.
+
+    Raises:
+        ValueError: a picture has not two axes, weights have another shape than the template, or the formulation does
+            not know the warp.
+
+    References:
+        Lucas and Kanade, 1981; Baker and Matthews, "Lucas-Kanade 20 years on", IJCV 56(3), 2004 [K-12, K-20, K-21,
+        K-27, K-72].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> u, v = jnp.meshgrid(jnp.arange(60.0), jnp.arange(50.0))
+        >>> scene = lambda u, v: 100 + 40 * jnp.sin(0.3 * u) * jnp.cos(0.25 * v)
+        >>> image, template = 0.7 * scene(u, v) + 20, scene(u + 12.3, v + 9.6)[:32, :32]
+        >>> start = jl.images.Translation(jnp.array([11.0, 11.0]))
+        >>> fit = jl.alignment.lucas_kanade.align(image, template, jl.images.Translation, start)
+        >>> bool(fit.ok), [round(x, 1) for x in fit.value.translation.tolist()]
+        (True, [12.3, 9.6])
+    """
+    return _align(take(image, template, weights, sigma, method), start_of(warp, initial, template))
+
+
+def take(image: Any, template: Any, weights: Any, sigma: Any, method: LucasKanade) -> Evidence:
+    """The pictures as numbers of one dtype, with their weights.
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+    template = as_grey(template)
+    if weights is not None and weights.shape != template.shape:
+        raise ValueError(f"align: weights of shape {weights.shape} do not fit a template of shape {template.shape}.")
+    given = jnp.ones_like(template) if weights is None else jnp.asarray(weights).astype(template.dtype)
+    sigma = None if sigma is None else jnp.asarray(sigma, template.dtype)
+    return Evidence(as_grey(image, template.dtype), template, given, sigma, Frame.of(template.shape), method)
+
+
+def start_of(warp: type[Warp], initial: Warp | None, template: Any) -> Warp:
+    """The start as a member of the group, in the template's dtype."""
+    dtype = as_grey(template).dtype
+    start = warp.identity(dtype) if initial is None else warp.of(initial)
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), start)
+
+
+@eqx.filter_jit
+def _align(evidence: Evidence, start: Warp) -> Estimate:
+    start, finite = finite_start(start)
+    detached = jax.lax.stop_gradient(evidence)
+    levels = detached.levels()
+    found = search(detached, levels, evidence.frame.normalize(start), zero_brightness(levels[0]))
+    return estimate(evidence, found, finite)
+
+
+def finite_start(start: Warp) -> tuple[Warp, Bool[Array, ""]]:
+    """The start without gradient, the identity if it has numbers that are none, and whether it has not."""
+    finite = jnp.all(jnp.isfinite(start.matrix()))
+    other = type(start).identity(start.matrix().dtype)
+    safe = jax.tree.map(lambda leaf, instead: jnp.where(finite, leaf, instead), start, other)
+    return jax.lax.stop_gradient(safe), finite
+
+
+def search(evidence: Evidence, levels: list[Level], warp: Warp, brightness: Float[Array, " k"]) -> Descended:
+    """From coarse to fine, over given levels."""
+    method, count, moved = evidence.method, jnp.zeros((), jnp.int32), jnp.zeros((), warp.matrix().dtype)
+    for number, level in enumerate(levels):
+        last = number == len(levels) - 1
+        limits = Limits(method.max_steps, method.tolerance * (1.0 if last else 10.0 * level.factor))
+        found = descend(level, warp, brightness, evidence.matching, method.descent, limits=limits)
+        warp, brightness, moved = found.warp, found.brightness, found.moved
+        count = count + found.num_steps
+    return Descended(warp, brightness, moved, count)
+
+
+def estimate(evidence: Evidence, found: Descended, finite: Bool[Array, ""]) -> Estimate:
+    """Judges where a search ended, and gives it the derivatives of a solution."""
+    judged = conclude(jax.lax.stop_gradient(evidence), found.warp, found.brightness, found.moved, finite)
+    followed = follow_root(found.warp, evidence, found.brightness, judged.ok)
+    value = evidence.frame.denormalize(followed)
+    return Estimate(
+        value, judged.covariance, judged.cost, judged.ok, found.num_steps, judged.status, judged.information
+    )

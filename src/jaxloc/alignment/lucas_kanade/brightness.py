@@ -1,0 +1,70 @@
+"""How grey levels may differ between two aligned pictures: what is solved for beside the warp and then dropped."""
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Brightness(eqx.Module):
+    """A linear model ``image = template + sum c_k B_k`` of exposure; the c_k are eliminated in closed form."""
+
+    correlating: eqx.AbstractClassVar[bool]
+
+    @abstractmethod
+    def columns(self, template: Float[Array, " n"]) -> Float[Array, "k n"]:
+        """The pictures B_k, given the template with zero mean and unit variance."""
+
+
+class Unchanged(Brightness):
+    """Grey levels stay as they are: the sum of squared differences."""
+
+    correlating: ClassVar[bool] = False
+
+    def columns(self, template: Float[Array, " n"]) -> Float[Array, "0 n"]:
+        """None."""
+        return jnp.zeros((0, template.shape[0]), template.dtype)
+
+
+class Bias(Brightness):
+    """All grey levels move by one number."""
+
+    correlating: ClassVar[bool] = False
+
+    def columns(self, template: Float[Array, " n"]) -> Float[Array, "1 n"]:
+        """A constant."""
+        return jnp.ones_like(template)[None]
+
+
+class GainBias(Brightness):
+    """Contrast and brightness change: least squares of what both leave.
+
+    References:
+        Baker, Gross, Matthews, "Lucas-Kanade 20 years on: part 3", 2003, section 3.3 (project-out) [K-22].
+    """
+
+    correlating: ClassVar[bool] = False
+
+    def columns(self, template: Float[Array, " n"]) -> Float[Array, "2 n"]:
+        """The template and a constant."""
+        return jnp.stack([template, jnp.ones_like(template)])
+
+
+class Correlation(Brightness):
+    """Contrast and brightness change: the greatest zero-mean normalized correlation (ECC).
+
+    Least squares with a gain also like dark places of the image, where little contrast leaves little residual; the
+    correlation does not.
+
+    References:
+        Evangelidis and Psarakis, "Parametric image alignment using enhanced correlation coefficient maximization",
+        T-PAMI 30(10), 2008, eq. 12 and 20.
+    """
+
+    correlating: ClassVar[bool] = True
+
+    def columns(self, template: Float[Array, " n"]) -> Float[Array, "2 n"]:
+        """The template and a constant."""
+        return jnp.stack([template, jnp.ones_like(template)])

@@ -1,0 +1,163 @@
+"""The pose of a camera straight from pixels: its picture laid upon a map image of a plane."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Num
+
+from jaxloc.images.interpolation import Bicubic, sample_components
+from jaxloc.images.normalize import as_grey
+from jaxloc.images.pyramid import gaussian_pyramid
+from jaxloc.poses import SE3
+from jaxloc.poses.group import matmul
+from jaxloc.sensors import Pinhole, TexturedPlane
+from jaxloc.solvers import Estimate, LevenbergMarquardt, Problem, Quadratic, solve
+from jaxloc.solvers.linear import factor
+
+
+class Appearance(eqx.Module):
+    """What is solved for: a pose, and how grey levels of the picture follow from those of the map.
+
+    Attributes:
+        pose: ``T_world_camera``.
+        gain: contrast of the picture over that of the map.
+        bias: in standard deviations of the map.
+    """
+
+    pose: SE3
+    gain: Float[Array, ""]
+    bias: Float[Array, ""]
+
+
+class PlaneAppearance(Problem):
+    """Differences between a picture and the map points that it shows, over their standard deviation.
+
+    Attributes:
+        camera: of the picture at this scale.
+        image: grey levels.
+        points: of the map, world frame, "3 n".
+        values: of the map there, zero mean and unit variance.
+        spread: standard deviation of the map's grey levels.
+        mean: of the map's grey levels.
+        sigma: standard deviation of a difference, grey levels.
+        loss: robust kernel.
+    """
+
+    camera: Pinhole
+    image: Float[Array, "h w"]
+    points: Float[Array, "3 n"]
+    values: Float[Array, " n"]
+    spread: Float[Array, ""]
+    mean: Float[Array, ""]
+    sigma: Float[Array, ""]
+    loss: Any = Quadratic()
+
+    def look(self, pose: SE3) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+        """The picture at the map's points, and where there is one."""
+        rotation = pose.rotation.matrix()
+        x, y, z = matmul(rotation.T, self.points - pose.translation[:, None])
+        front = self.camera.in_front_components(x, y, z)
+        u, v = self.camera.project_components(x, y, z)
+        values, inside = sample_components(self.image, u, v, method=Bicubic())
+        known = front & inside & jnp.isfinite(values)
+        return jnp.where(known, values, 0.0), known
+
+    def residual(self, state: Appearance) -> Float[Array, " n"]:
+        """Whitened differences; zero for points that are not seen."""
+        seen, known = self.look(state.pose)
+        expected = self.mean + self.spread * (state.gain * self.values + state.bias)
+        return jnp.where(known, (seen - expected) / self.sigma, 0.0)
+
+
+@eqx.filter_jit
+def refine_pose(
+    image: Num[Array, "h w"] | Any,
+    plane: TexturedPlane,
+    camera: Pinhole,
+    initial: SE3,
+    *,
+    sigma: Any = 3.0,
+    loss: Any = Quadratic(),
+    levels: int = 3,
+    stride: int = 2,
+) -> Estimate:
+    """Pose of a camera from its picture of a textured plane, starting at a guess.
+
+    Minimizes ``sum rho((image(project(T^-1 X_i)) - gain Z_i - bias) / sigma)`` over the pose ``T = T_world_camera``,
+    gain and bias, for the map's pixels X_i with grey levels Z_i, from coarse to fine.
+
+    Args:
+        image: the camera's picture, grey levels.
+        plane: the map.
+        camera: intrinsics and lens.
+        initial: guess of ``T_world_camera``.
+        sigma: standard deviation of a difference, grey levels: noise of the picture, faults of the map.
+        loss: robust kernel, in sigmas.
+        levels: of the pyramid; static.
+        stride: of the map's pixels that are compared at the finest level; static.
+
+    Returns:
+        Estimate of ``T_world_camera`` with covariance in its tangent (right perturbation). ``ok`` is False when less
+        than a tenth of the map is seen or the texture leaves directions undetermined.
+
+    References:
+        Kelly's image prediction as a map [K-11, K-12, K-45]; Lucas and Kanade, 1981.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxloc as jl
+        >>> texture = jax.image.resize(jax.random.uniform(jax.random.key(0), (12, 12)) * 200, (96, 96), "cubic")
+        >>> plane = jl.sensors.TexturedPlane(texture, 0.02, jl.poses.SE3.identity())
+        >>> camera = jl.sensors.Pinhole(100.0, 100.0, 47.5, 47.5)
+        >>> truth = jl.poses.SE3.exp(jnp.array([0.95, 0.95, -1.5, 0.0, 0.0, 0.05]))
+        >>> picture = plane.predict(camera, truth, shape=(96, 96)).image
+        >>> start = truth @ jl.poses.SE3.exp(jnp.array([0.03, -0.02, 0.05, 0.01, 0.0, 0.01]))
+        >>> fit = jl.alignment.plane_pose.refine_pose(picture, plane, camera, start)
+        >>> bool(fit.ok), bool(jnp.linalg.norm(fit.value.translation - truth.translation) < 0.01)
+        (True, True)
+    """
+    image = as_grey(image, plane.texture.dtype)
+    pictures, maps = gaussian_pyramid(image, levels=levels), gaussian_pyramid(plane.texture, levels=levels)
+    one = jnp.ones((), image.dtype)
+    state = Appearance(initial, one, jnp.zeros_like(one))
+    sigma = jnp.asarray(sigma, image.dtype)
+    fit, problem = None, None
+    for level in reversed(range(levels)):
+        problem = _problem(pictures[level], maps[level], plane, camera, level, sigma, loss, stride if level == 0 else 1)
+        # Grey levels between pixels are smooth but not quadratic: no more digits are to be had than these.
+        solver = LevenbergMarquardt(rtol=1e-4 if image.dtype == jnp.float32 else 1e-7)
+        fit = solve(problem, state, solver=solver)
+        state = fit.value
+    return _pose_of(fit, problem)
+
+
+def _problem(
+    image: Array,
+    texture: Array,
+    plane: TexturedPlane,
+    camera: Pinhole,
+    level: int,
+    sigma: Array,
+    loss: Any,
+    stride: int,
+) -> PlaneAppearance:
+    shrink = 2.0**level
+    u, v = jnp.meshgrid(*(jnp.arange(0, size, stride, dtype=texture.dtype) for size in texture.shape[::-1]))
+    points = plane.points(shrink * jnp.stack([u.reshape(-1), v.reshape(-1)], axis=1))
+    values = texture[::stride, ::stride].reshape(-1)
+    mean, spread = jnp.mean(values), jnp.std(values)
+    spread = jnp.where(spread > 0, spread, 1.0)
+    focal = camera.fx / shrink, camera.fy / shrink
+    scaled = Pinhole(*focal, camera.cx / shrink, camera.cy / shrink, camera.skew / shrink, camera.lens)
+    return PlaneAppearance(scaled, image, points.T, (values - mean) / spread, spread, mean, sigma, loss)
+
+
+def _pose_of(fit: Estimate, problem: PlaneAppearance) -> Estimate:
+    """The estimate of the pose alone: brightness marginalized."""
+    info = fit.information
+    across = info[:6, 6:]
+    solver = factor(info[6:, 6:])
+    kept = info[:6, :6] - matmul(across, jnp.stack([solver.solve(row) for row in across], axis=1))
+    _, known = problem.look(fit.value.pose)
+    ok = fit.ok & (jnp.mean(known) >= 0.1) & (fit.value.gain > 0)
+    return Estimate(fit.value.pose, fit.covariance[:6, :6], fit.cost, ok, fit.num_steps, fit.status, kept)

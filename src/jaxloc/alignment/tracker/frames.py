@@ -1,0 +1,141 @@
+"""An image made ready for tracking: all pyramid levels in one array, and the spread of its brightness."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxloc.images.pyramid import gaussian_pyramid
+
+_SAMPLES = 4096
+
+
+class Frame(eqx.Module):
+    """An image with what every tracked point needs of it, computed once.
+
+    Attributes:
+        atlas: Every level with repeated border pixels, level 0 on top, all others side by side below it. Gradients pass
+            through level 0 only.
+        finite: Pixels of level 0, its border included, that are numbers.
+        spread: Sorted sample of grey levels of a coarse level, to compare exposures.
+        shape: Rows and columns of the image.
+        levels: Number of pyramid levels.
+        margin: Repeated pixels round every level.
+    """
+
+    atlas: Float[Array, "a b"]
+    finite: Bool[Array, "c d"]
+    spread: Float[Array, " s"]
+    shape: tuple[int, int] = eqx.field(static=True)
+    levels: int = eqx.field(static=True)
+    margin: int = eqx.field(static=True)
+
+
+def build_frame(image: Float[Array, "h w"], levels: int, margin: int) -> Frame:
+    """Builds the pyramid and packs it; what is not a number becomes the mean of the others.
+
+    Args:
+        image: Grey image.
+        levels: Number of pyramid levels.
+        margin: Pixels by which the border of every level is repeated.
+
+    Returns:
+        The frame.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> frame = build_frame(jnp.ones((40, 50)), 3, 6)
+        >>> frame.atlas.shape, frame.finite.shape
+        ((84, 62), (52, 62))
+    """
+    finite = jnp.isfinite(image)
+    mean = jnp.sum(jnp.where(finite, image, 0.0)) / jnp.maximum(jnp.sum(finite, dtype=jnp.int32), 1).astype(image.dtype)
+    clean = jnp.where(finite, image, lax.stop_gradient(mean))
+    pyramid = (clean, *gaussian_pyramid(lax.stop_gradient(clean), levels=levels)[1:])
+    padded = [jnp.pad(level, margin, mode="edge") for level in pyramid]
+    height, width = _atlas_shape(image.shape, levels, margin)
+    atlas = jnp.zeros((height, width), dtype=image.dtype)
+    for level, corner in zip(padded, _corners(image.shape, levels, margin), strict=True):
+        atlas = lax.dynamic_update_slice(atlas, level, (corner[1], corner[0]))
+    return Frame(atlas, jnp.pad(finite, margin, mode="edge"), _spread(pyramid), image.shape, levels, margin)
+
+
+def level_corners(frame: Frame) -> Int[Array, "l 2"]:
+    """Where (column, row) in the atlas pixel (0, 0) of each level lies.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> level_corners(build_frame(jnp.ones((40, 50)), 3, 6)).tolist()
+        [[6, 6], [6, 58], [43, 58]]
+    """
+    corners = _corners(frame.shape, frame.levels, frame.margin)
+    return jnp.array([[u + frame.margin, v + frame.margin] for u, v in corners], dtype=jnp.int32)
+
+
+def level_sizes(frame: Frame) -> Int[Array, "l 2"]:
+    """Columns and rows of each level.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> level_sizes(build_frame(jnp.ones((40, 50)), 3, 6)).tolist()
+        [[50, 40], [25, 20], [13, 10]]
+    """
+    return jnp.array([shape[::-1] for shape in _shapes(frame.shape, frame.levels)], dtype=jnp.int32)
+
+
+def relative_gain(previous: Frame, current: Frame) -> Float[Array, ""]:
+    """Contrast of one frame relative to another: slope of the regression of sorted grey levels on sorted grey levels.
+
+    The lowest and highest twentieth are left out, so that neither saturated pixels nor small new bright things count.
+    No pixels are matched: the scene may move.
+
+    Args:
+        previous: Frame of contrast 1.
+        current: Frame whose contrast is asked for.
+
+    Returns:
+        The gain, between 1/8 and 8; 1 where a frame has no contrast.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> image = 100 + 30 * jax.random.normal(jax.random.key(0), (40, 50))
+        >>> first, second = build_frame(image, 3, 6), build_frame(0.6 * image + 30, 3, 6)
+        >>> round(float(relative_gain(first, second)), 2)
+        0.6
+    """
+    cut = previous.spread.shape[0] // 20
+    first, second = (frame.spread[cut : frame.spread.shape[0] - cut] for frame in (previous, current))
+    first, second = first - jnp.mean(first), second - jnp.mean(second)
+    below, above = jnp.sum(first * first), jnp.sum(first * second)
+    # A spread of less than a hundredth of a grey level a sample is none.
+    some = (below > 1e-4 * first.size) & (above > 1e-4 * first.size)
+    gain = jnp.where(some, above, 1.0) / jnp.where(some, below, 1.0)
+    return lax.stop_gradient(jnp.clip(gain, 0.125, 8.0))
+
+
+def _spread(pyramid: tuple[Float[Array, "_ _"], ...]) -> Float[Array, " s"]:
+    """Sorted grey levels, evenly taken, of a level smooth enough to have little noise."""
+    level = pyramid[min(2, len(pyramid) - 1)]
+    stride = max(1, round((level.size / _SAMPLES) ** 0.5))
+    return jnp.sort(lax.stop_gradient(level)[::stride, ::stride].reshape(-1))
+
+
+def _shapes(shape: tuple[int, int], levels: int) -> list[tuple[int, int]]:
+    """Rows and columns of each level."""
+    return [(-(-shape[0] // 2**level), -(-shape[1] // 2**level)) for level in range(levels)]
+
+
+def _corners(shape: tuple[int, int], levels: int, margin: int) -> list[tuple[int, int]]:
+    """Where (column, row) each padded level starts in the atlas."""
+    corners, column = [(0, 0)], 0
+    for _, width in _shapes(shape, levels)[1:]:
+        corners.append((column, shape[0] + 2 * margin))
+        column += width + 2 * margin
+    return corners
+
+
+def _atlas_shape(shape: tuple[int, int], levels: int, margin: int) -> tuple[int, int]:
+    sides = [(rows + 2 * margin, columns + 2 * margin) for rows, columns in _shapes(shape, levels)]
+    below = sides[1:]
+    height = sides[0][0] + max((rows for rows, _ in below), default=0)
+    return height, max(sides[0][1], sum(columns for _, columns in below))
