@@ -129,9 +129,7 @@ def _information(scenes: list[np.ndarray], repeats: int) -> Iterator[Metric]:
         tolerance = None if key.endswith("ecc") else 0.02
         yield Metric(f"correlation.information.{key}.within", float(np.mean(within)), "share", "higher", tolerance)
     ours = quickest(lambda: jax.tree.leaves(mutual_information.align(*views, Affine, begin)), repeats)
-    theirs = quickest(lambda: _ecc(image, template, start), repeats)
     yield Metric("correlation.information", 1e3 * ours.wall, "ms", "lower", TIME)
-    yield Metric("correlation.information.ecc", 1e3 * theirs.wall, "ms")
 
 
 def _ecc(image: np.ndarray, template: np.ndarray, start: np.ndarray) -> np.ndarray:

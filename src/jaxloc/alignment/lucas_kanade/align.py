@@ -81,7 +81,8 @@ def take(image: Any, template: Any, weights: Any, sigma: Any, method: LucasKanad
         raise ValueError(f"align: weights of shape {weights.shape} do not fit a template of shape {template.shape}.")
     given = jnp.ones_like(template) if weights is None else jnp.asarray(weights).astype(template.dtype)
     sigma = None if sigma is None else jnp.asarray(sigma, template.dtype)
-    return Evidence(as_grey(image, template.dtype), template, given, sigma, Frame.of(template.shape), method)
+    frame = Frame.of(template.shape, method.normalized)
+    return Evidence(as_grey(image, template.dtype), template, given, sigma, frame, method)
 
 
 def start_of(warp: type[Warp], initial: Warp | None, template: Any) -> Warp:

@@ -1,5 +1,7 @@
 """The iterations at one scale."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -78,7 +80,9 @@ def descend(
         return _Search(trial, best, known, damping, jnp.where(possible, moved, 0.0), search.count + 1)
 
     end = lax.while_loop(unfinished, advance, initial)
-    # The last step of a guarded descent has not been judged yet.
+    if not descent.guarded:
+        return Descended(end.trial, end.known.brightness, end.moved, end.count)
+    # The last step has not been judged yet.
     now = compare(end.trial, end.known.brightness)
     warp, known = _choose(descent.accepts(now, end.known), (end.trial, now), (end.best, end.known))
     return Descended(warp, known.brightness, end.moved, end.count)
@@ -105,5 +109,5 @@ def travelled(level: Level, before: Warp, after: Warp) -> Float[Array, ""]:
     return jnp.where(far < 1e5, far, jnp.inf)
 
 
-def _choose(accept: Bool[Array, ""], new: object, old: object) -> object:
+def _choose(accept: Bool[Array, ""], new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, old)

@@ -181,7 +181,7 @@ def equations(
     brightness: Float[Array, " k"],
     matching: Matching,
     *,
-    second: bool = False,
+    second: float = 0.0,
 ) -> Equations:
     """The normal equations at a warp.
 
@@ -191,7 +191,7 @@ def equations(
         warp: in normalized coordinates.
         brightness: coefficients by which outliers are told.
         matching: how pictures are compared.
-        second: whether second derivatives enter the Hessian.
+        second: how much of the second derivatives' part enters the Hessian.
 
     Returns:
         Equations in which brightness is eliminated. The Hessian of an inverse formulation without robust weights is
@@ -210,7 +210,7 @@ def equations(
     if second:
         residual = weighted.difference - matmul(sums.coefficients, level.columns)
         sign = -1.0 / jnp.maximum(gain, 0.25) if matching.formulation.inverse else jnp.ones_like(gain)
-        hessian = hessian + sign * _second_order(level, warp, linear, residual * weighted.weight, matching)
+        hessian = hessian + second * sign * _second_order(level, warp, linear, residual * weighted.weight, matching)
     seen = total > 0
     mean_cost = jnp.where(seen, 0.5 * sums.squares / jnp.where(seen, total, 1.0), jnp.inf)
     return Equations(hessian, sums.gradient, sums.coefficients, gain, mean_cost)

@@ -154,8 +154,7 @@ class InverseAdditive(Formulation):
 
     def second(self, level: Level, warp: Warp, method: AbstractInterpolation) -> Float[Array, "3 n"]:
         """Those of the template."""
-        picture = second_derivatives(level.template.reshape(level.shape), level)
-        return jnp.where(level.weight > 0, picture.reshape(3, -1), 0.0)
+        return _template_second(level)
 
 
 class InverseCompositional(Formulation):
@@ -177,8 +176,7 @@ class InverseCompositional(Formulation):
 
     def second(self, level: Level, warp: Warp, method: AbstractInterpolation) -> Float[Array, "3 n"]:
         """Those of the template."""
-        picture = second_derivatives(level.template.reshape(level.shape), level)
-        return jnp.where(level.weight > 0, picture.reshape(3, -1), 0.0)
+        return _template_second(level)
 
 
 def _of_template(level: Level, warp: Warp, method: AbstractInterpolation) -> Linearized:
@@ -221,6 +219,11 @@ def second_derivatives(picture: Float[Array, "h w"], level: Level) -> Float[Arra
     along, across = derivatives(picture) * scale
     (uu, uv), (_, vv) = derivatives(along) * scale, derivatives(across) * scale
     return jnp.stack([uu, uv, vv])
+
+
+def _template_second(level: Level) -> Float[Array, "3 n"]:
+    second = second_derivatives(level.picture, level).reshape(3, -1)
+    return jnp.where((level.weight > 0)[None] & jnp.isfinite(second), second, 0.0)
 
 
 def _seen_second(level: Level, warp: Warp, method: AbstractInterpolation) -> Float[Array, "3 n"]:

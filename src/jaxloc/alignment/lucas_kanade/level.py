@@ -26,9 +26,11 @@ class Frame(eqx.Module):
     radius: float = eqx.field(static=True)
 
     @staticmethod
-    def of(shape: tuple[int, int]) -> "Frame":
-        """The frame of a template of rows and columns."""
+    def of(shape: tuple[int, int], normalized: bool = True) -> "Frame":
+        """The frame of a template of rows and columns; if it is not normalized, pixels counted from one."""
         rows, columns = shape
+        if not normalized:
+            return Frame((-1.0, -1.0), 1.0)
         return Frame((0.5 * (columns - 1), 0.5 * (rows - 1)), max(0.5 * (max(shape) - 1), 0.5))
 
     def _to_pixels(self, dtype: Any) -> Similarity:
@@ -58,7 +60,8 @@ class Level(eqx.Module):
     Attributes:
         image: the picture, with nan where there is none.
         channels: the picture and its derivatives by u and v, where they are needed.
-        template: its values, n pixels.
+        picture: the template, with nan where there is none.
+        template: its values, n pixels, zero where there is none.
         u: normalized column of each template pixel.
         v: normalized row.
         weight: of each template pixel; zero where there is none.
@@ -73,6 +76,7 @@ class Level(eqx.Module):
 
     image: Float[Array, "h w"]
     channels: Float[Array, "h w 3"] | None
+    picture: Float[Array, "p q"]
     template: Float[Array, " n"]
     u: Float[Array, " n"]
     v: Float[Array, " n"]
@@ -115,6 +119,7 @@ class Level(eqx.Module):
         return Level(
             image,
             channels,
+            template,
             values,
             grid_u.reshape(-1),
             grid_v.reshape(-1),

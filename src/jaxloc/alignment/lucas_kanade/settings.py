@@ -26,6 +26,8 @@ class LucasKanade(eqx.Module):
             camera, 0 for a clean map.
         min_coverage: least part of the template that must lie on the image.
         min_correlation: least correlation of a trusted result.
+        normalized: whether unknowns are counted in units of the template. Gauss-Newton does not care; in pixels counted
+            from the corner, as in the paper, steepest descent and diagonal Hessians fail.
     """
 
     formulation: Formulation = InverseCompositional()
@@ -39,3 +41,4 @@ class LucasKanade(eqx.Module):
     template_noise: float = eqx.field(static=True, default=1.0)
     min_coverage: float = eqx.field(static=True, default=0.5)
     min_correlation: float = eqx.field(static=True, default=0.5)
+    normalized: bool = eqx.field(static=True, default=True)

@@ -248,8 +248,8 @@ def _align(image: Array, template: Array, weight: Array, start: Warp, method: Mu
 
     # One compiled loop for all blurs.
     stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *lax.stop_gradient(scales))
-    start = (warp, jnp.zeros((), image.dtype), jnp.zeros((), jnp.int32))
-    (warp, moved, count), _ = lax.scan(climb, start, stack)
+    begin = (warp, jnp.zeros((), image.dtype), jnp.zeros((), jnp.int32))
+    (warp, moved, count), _ = lax.scan(climb, begin, stack)
     return _conclude(scales[-1], warp, moved, count, finite, method)
 
 
