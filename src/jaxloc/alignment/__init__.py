@@ -2,22 +2,32 @@
 
 from jaxloc.alignment import (
     correlation,
+    departure,
+    dickmanns,
     ecc,
+    ground_view,
     lucas_kanade,
+    mosaic,
     multi_start,
     mutual_information,
     phase,
     plane_pose,
+    ralph,
     tracker,
 )
 
 __all__ = [
     "correlation",
+    "departure",
+    "dickmanns",
     "ecc",
+    "ground_view",
     "lucas_kanade",
+    "mosaic",
     "multi_start",
     "mutual_information",
     "phase",
     "plane_pose",
+    "ralph",
     "tracker",
 ]

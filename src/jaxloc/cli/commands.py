@@ -146,3 +146,71 @@ def track(
         if value not in known:
             raise typer.BadParameter(f"{name} is {value!r}, must be one of {', '.join(known)}")
     return command.run_detections(command.Inputs(detections, form, poses, calib, truth, tracker), out, config)
+
+
+@app.command()
+def lane(
+    path: Annotated[Path, typer.Argument(help="Image, folder of images, or video of a camera that looks ahead.")],
+    camera: Annotated[
+        Path,
+        typer.Option("--camera", metavar="CAMERA.yaml", help="OpenCV's camera file, plus height_m (pitch_rad)."),
+    ],
+    speed: Annotated[
+        float, typer.Option("--speed", metavar="M/S", min=0.0, help="Of the vehicle: how far ahead to look.")
+    ] = 20.0,
+    out: _Out = Path("out"),
+    config: _Config = None,
+) -> int:
+    """Find where in its lane a vehicle is, and how the lane bends.
+
+    Writes lane.csv (m left of the lane's center, rad, 1/m), borders.csv (columns of the lane's borders in the image),
+    annotated pictures or a video, metrics.json, report.html and config.yaml.
+    """
+    from jaxloc.cli import lane as command
+
+    return command.run_recording(path, camera, speed, out, config)
+
+
+@app.command()
+def calibrate(
+    images: Annotated[list[Path], typer.Argument(help="Pictures of a chessboard by one camera, or folders of them.")],
+    grid: Annotated[str, typer.Option("--grid", metavar="9x6", help="Inner corners of the board: along, down.")],
+    square: Annotated[float, typer.Option("--square", metavar="M", help="Edge of a square, m.")],
+    right: Annotated[
+        list[Path] | None,
+        typer.Option("--right", metavar="PATH", help="Pictures (or a folder) of the right camera of a stereo rig."),
+    ] = None,
+    out: _Out = Path("out"),
+    config: _Config = None,
+) -> int:
+    """Find focal lengths, principal point and lens of a camera, or of two, from pictures of a chessboard.
+
+    Writes camera.yaml (OpenCV's format, with the parameters' covariance), of two cameras also right.yaml and
+    stereo.yaml (with rectification), corners.csv, metrics.json, report.html and config.yaml.
+    """
+    from jaxloc.cli import calibrate as command
+
+    return command.run_images(images, right, (grid, square), out, config)
+
+
+@app.command()
+def mosaic(
+    frames: Annotated[Path, typer.Argument(help="Folder of pictures of a floor, in the order of their names.")],
+    odometry: Annotated[
+        Path,
+        typer.Option("--odometry", metavar="FILE", help="Poses of the camera over the floor (TUM), a row a picture."),
+    ],
+    camera: Annotated[
+        Path,
+        typer.Option("--camera", metavar="CAMERA.yaml", help="OpenCV's camera file, with height_m over the floor."),
+    ],
+    out: _Out = Path("out"),
+    config: _Config = None,
+) -> int:
+    """Join pictures of a floor to one map, to be localized in later.
+
+    Writes mosaic.png, mosaic.yaml (resolution and origin), trajectory.tum, metrics.json, report.html and config.yaml.
+    """
+    from jaxloc.cli import mosaic as command
+
+    return command.run_frames(frames, odometry, camera, out, config)

@@ -1,10 +1,12 @@
 """Files and synthetic worlds that give the library's own records."""
 
 from jaxloc.data import (
+    camera_file,
     carmen,
     covariance,
     kitti,
     landmarks,
+    lanes,
     laser_log,
     maps,
     png,
@@ -33,10 +35,12 @@ __all__ = [
     "StereoPairs",
     "StereoSequence",
     "StreetSequence",
+    "camera_file",
     "carmen",
     "covariance",
     "kitti",
     "landmarks",
+    "lanes",
     "laser_log",
     "maps",
     "png",

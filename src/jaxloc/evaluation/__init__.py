@@ -12,6 +12,7 @@ from jaxloc.evaluation import (
     report,
     targets,
     trajectories,
+    update_rate,
 )
 from jaxloc.evaluation.alignments import NoAlignment, RigidAlignment, SimilarityAlignment
 from jaxloc.evaluation.drift import SegmentErrors, end_drift_percent, segment_errors
@@ -54,4 +55,5 @@ __all__ = [
     "segment_errors",
     "targets",
     "trajectories",
+    "update_rate",
 ]

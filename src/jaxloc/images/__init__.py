@@ -1,6 +1,7 @@
 """Pixels to samples, keypoints and matches."""
 
 from jaxloc.images import (
+    chessboard,
     corners,
     describe,
     detect,
@@ -35,6 +36,7 @@ __all__ = [
     "Similarity",
     "Translation",
     "Warp",
+    "chessboard",
     "corners",
     "describe",
     "detect",

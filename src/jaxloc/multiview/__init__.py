@@ -1,6 +1,6 @@
 """Closed-form geometry of several views."""
 
-from jaxloc.multiview import minimal, triangulation
+from jaxloc.multiview import minimal, rectification, triangulation
 from jaxloc.multiview.minimal import MinimalPoses, p3p
 from jaxloc.multiview.triangulation import Linear, Sampled, TriangulationMethod, Unscented, coverage, stereo
 
@@ -13,6 +13,7 @@ __all__ = [
     "coverage",
     "minimal",
     "p3p",
+    "rectification",
     "stereo",
     "triangulation",
 ]

@@ -4,8 +4,10 @@ from jaxloc.sensors import (
     camera,
     ceiling,
     distortion,
+    ground,
     increments,
     landmarks,
+    lane,
     laser,
     maps,
     moving_objects,
@@ -17,8 +19,10 @@ from jaxloc.sensors import (
 from jaxloc.sensors.camera import Pinhole
 from jaxloc.sensors.ceiling import CeilingMosaic, CeilingSensor
 from jaxloc.sensors.distortion import BrownConrady, KannalaBrandt, Lens
+from jaxloc.sensors.ground import GroundCamera
 from jaxloc.sensors.increments import Increment, IncrementMotion
 from jaxloc.sensors.landmarks import RangeBearing, RangeBearingSensor
+from jaxloc.sensors.lane import Lane
 from jaxloc.sensors.laser import BeamModel, LaserScan, LikelihoodField
 from jaxloc.sensors.maps import DistanceField, FreeSpace, OccupancyMap
 from jaxloc.sensors.moving_objects import MovingObject, MovingObjectSensor
@@ -35,9 +39,11 @@ __all__ = [
     "DifferentialDrive",
     "DistanceField",
     "FreeSpace",
+    "GroundCamera",
     "Increment",
     "IncrementMotion",
     "KannalaBrandt",
+    "Lane",
     "LaserScan",
     "Lens",
     "LikelihoodField",
@@ -58,8 +64,10 @@ __all__ = [
     "camera",
     "ceiling",
     "distortion",
+    "ground",
     "increments",
     "landmarks",
+    "lane",
     "laser",
     "maps",
     "moving_objects",

@@ -1,6 +1,6 @@
 """Trajectories and maps."""
 
-from jaxloc.slam import ekf_slam, moving_objects, scene_flow, stereo_matching, visual_odometry
+from jaxloc.slam import ekf_slam, moving_objects, pose_graph, scene_flow, stereo_matching, visual_odometry
 from jaxloc.slam.ekf_slam import EkfSlam, SlamInfo, SlamState
 from jaxloc.slam.moving_objects import GroupOptions, MovingObjects, group_points
 from jaxloc.slam.scene_flow import FlowOptions, MovingPoints, find_moving
@@ -27,6 +27,7 @@ __all__ = [
     "match_frames",
     "match_stereo",
     "moving_objects",
+    "pose_graph",
     "scene_flow",
     "stereo_matching",
     "visual_odometry",

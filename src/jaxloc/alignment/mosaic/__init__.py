@@ -1,0 +1,40 @@
+"""Mosaics of floors: pictures laid side by side to a map, and a camera followed in it."""
+
+from jaxloc.alignment.mosaic.blend import Exposure, balance, blend, enclose
+from jaxloc.alignment.mosaic.features import (
+    FeaturePairs,
+    Squares,
+    feature_jacobian,
+    pose_from_features,
+    register_squares,
+)
+from jaxloc.alignment.mosaic.raster import Raster
+from jaxloc.alignment.mosaic.register import PAIRWISE, Overlap, Registration, register
+from jaxloc.alignment.mosaic.track import TRACKING, track
+from jaxloc.alignment.mosaic.view import CosineFourth, Falloff, FloorView, Patch, RadialFalloff, Rectifier, fit_falloff
+
+__all__ = [
+    "PAIRWISE",
+    "TRACKING",
+    "CosineFourth",
+    "Exposure",
+    "Falloff",
+    "FeaturePairs",
+    "FloorView",
+    "Overlap",
+    "Patch",
+    "RadialFalloff",
+    "Raster",
+    "Rectifier",
+    "Registration",
+    "Squares",
+    "balance",
+    "blend",
+    "enclose",
+    "feature_jacobian",
+    "fit_falloff",
+    "pose_from_features",
+    "register",
+    "register_squares",
+    "track",
+]

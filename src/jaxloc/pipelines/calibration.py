@@ -1,0 +1,171 @@
+"""Corners of a chessboard in; a calibrated camera, or a calibrated and rectified pair, out. In float64, on the host."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from jaxloc.multiview.rectification import Rectification, rectify
+from jaxloc.refinement.calibration import (
+    Corners,
+    Fisheye,
+    Glass,
+    Intrinsics,
+    Parameters,
+    board_errors,
+    calibrate,
+    calibrate_stereo,
+    camera_parameters,
+)
+from jaxloc.sensors import Pinhole
+from jaxloc.solvers import Estimate, Huber, Quadratic
+
+
+class Config(eqx.Module):
+    """What is looked for.
+
+    Attributes:
+        radial: radial coefficients of the lens: 0 to 3, or 6 for the rational model; 0 to 4 of a fisheye.
+        tangential: whether coefficients of decentering are looked for.
+        fisheye: whether the lens is one.
+        square_pixels: one focal length for rows and columns.
+        principal_point: whether it is looked for; otherwise it is the center of the pictures.
+        robust: distance, in sigmas, from which a corner counts less; 0 for plain least squares.
+    """
+
+    radial: int = 3
+    tangential: bool = True
+    fisheye: bool = False
+    square_pixels: bool = False
+    principal_point: bool = True
+    robust: float = 0.0
+
+    def __check_init__(self) -> None:
+        self.intrinsics()
+        if self.robust < 0.0:
+            raise ValueError(f"robust is {self.robust:g}, must not be negative")
+
+    def intrinsics(self) -> Intrinsics:
+        """Which parameters move."""
+        lens = Fisheye(self.radial) if self.fisheye else Glass(self.radial, self.tangential)
+        return Intrinsics(lens, self.square_pixels, self.principal_point)
+
+
+class Views(eqx.Module):
+    """Pictures of a board.
+
+    Attributes:
+        board: corners in the frame of the board, m.
+        corners: "boards corners 2", px; zero where the board was not found.
+        found: pictures in which it was.
+        shape: (rows, columns).
+    """
+
+    board: Float64[np.ndarray, "m 3"]
+    corners: Float64[np.ndarray, "n m 2"]
+    found: Bool[np.ndarray, " n"]
+    shape: tuple[int, int]
+
+
+class Side(eqx.Module):
+    """What is known of one camera.
+
+    Attributes:
+        camera: the camera.
+        parameters: its numbers, with covariance.
+        errors: predicted minus measured corners, px; zero where the board was not found.
+        board_rms: of each picture, px; zero where the board was not found.
+        rms: of all, px.
+    """
+
+    camera: Pinhole
+    parameters: Parameters
+    errors: Float64[np.ndarray, "n m 2"]
+    board_rms: Float64[np.ndarray, " n"]
+    rms: float
+
+
+class Result(eqx.Module):
+    """A calibration.
+
+    Attributes:
+        sides: the camera, or the left and the right one.
+        estimate: of all unknowns.
+        rectification: of a pair.
+        status: in words.
+    """
+
+    sides: tuple[Side, ...]
+    estimate: Estimate
+    rectification: Rectification | None
+    status: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether it can be used."""
+        return bool(self.estimate.ok)
+
+
+def run(views: tuple[Views, ...], config: Config = Config()) -> Result:
+    """Calibrates one camera, or two that are fixed to each other, in float64 whatever JAX's default is.
+
+    Args:
+        views: of the camera; or of the left and of the right camera, picture by picture at the same instants.
+        config: what is looked for.
+
+    Returns:
+        The calibration.
+
+    Raises:
+        ValueError: if there are not one or two cameras, or two with different numbers of pictures.
+    """
+    if len(views) not in (1, 2) or len({len(side.corners) for side in views}) != 1:
+        raise ValueError("Give the views of one camera, or of two with as many pictures each.")
+    with jax.enable_x64(True):
+        return _mono(views[0], config) if len(views) == 1 else _stereo(views[0], views[1], config)
+
+
+def _loss(config: Config) -> Any:
+    return Huber(config.robust) if config.robust > 0.0 else Quadratic()
+
+
+def _mono(views: Views, config: Config) -> Result:
+    board, corners = jnp.asarray(views.board), _corners(views)
+    fit = calibrate(
+        board,
+        corners.pixels,
+        valid=corners.valid,
+        intrinsics=config.intrinsics(),
+        shape=views.shape,
+        loss=_loss(config),
+    )
+    side = _side(fit.value.camera, fit.value.T_camera_board, views, camera_parameters(fit))
+    return Result((side,), fit, None, fit.describe())
+
+
+def _stereo(left: Views, right: Views, config: Config) -> Result:
+    sides = _corners(left), _corners(right)
+    board = jnp.asarray(left.board)
+    fit = calibrate_stereo(board, *sides, intrinsics=config.intrinsics(), shape=left.shape, loss=_loss(config))
+    value = fit.value
+    boards_right = jax.vmap(lambda pose: value.T_left_right.inverse() @ pose)(value.T_left_board)
+    pair = (
+        _side(value.left, value.T_left_board, left, camera_parameters(fit, 0)),
+        _side(value.right, boards_right, right, camera_parameters(fit, 1)),
+    )
+    rectified = rectify(value.left, value.right, value.T_left_right, shape=left.shape)
+    return Result(pair, fit, rectified, fit.describe())
+
+
+def _corners(views: Views) -> Corners:
+    shown = np.broadcast_to(views.found[:, None], views.corners.shape[:2])
+    return Corners(jnp.asarray(views.corners), jnp.asarray(shown))
+
+
+def _side(camera: Pinhole, boards: Any, views: Views, parameters: Parameters) -> Side:
+    corners = _corners(views)
+    left_over = board_errors(camera, boards, jnp.asarray(views.board), corners.pixels, valid=corners.valid)
+    return Side(camera, parameters, np.asarray(left_over.errors), np.asarray(left_over.board_rms), float(left_over.rms))

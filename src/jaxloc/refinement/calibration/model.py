@@ -1,0 +1,183 @@
+"""What is to be found of a camera: which of its parameters move, and in which units the solver sees them."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxloc.poses.group import matmul
+from jaxloc.sensors import BrownConrady, KannalaBrandt, Pinhole
+from jaxloc.sensors.distortion import Lens
+
+_PINHOLE = ("fx", "fy", "cx", "cy", "skew")
+
+
+class LensModel(eqx.Module):
+    """Which lens a camera has, and which of its coefficients move; the others are zero."""
+
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """All coefficients, in the order of the lens."""
+
+    @abstractmethod
+    def free(self) -> tuple[str, ...]:
+        """Those that move."""
+
+    @abstractmethod
+    def make(self, coefficients: Float[Array, " c"]) -> Lens | None:
+        """The lens with these coefficients."""
+
+
+class NoLens(LensModel):
+    """An ideal pinhole."""
+
+    def names(self) -> tuple[str, ...]:
+        """None."""
+        return ()
+
+    def free(self) -> tuple[str, ...]:
+        """None."""
+        return ()
+
+    def make(self, coefficients: Float[Array, " c"]) -> Lens | None:
+        """No lens."""
+        del coefficients
+        return None
+
+
+class Glass(LensModel):
+    """The usual glass lens, `BrownConrady`.
+
+    Attributes:
+        radial: how many radial coefficients move: 0 to 3, or 6 for the rational model.
+        tangential: whether the two of decentering move.
+    """
+
+    radial: int = eqx.field(static=True, default=3)
+    tangential: bool = eqx.field(static=True, default=True)
+
+    def __check_init__(self) -> None:
+        if self.radial not in (0, 1, 2, 3, 6):
+            raise ValueError(f"Glass got radial={self.radial}; it must be 0, 1, 2, 3, or 6 (rational).")
+
+    def names(self) -> tuple[str, ...]:
+        """Five, or eight of the rational model, in OpenCV's order."""
+        return ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")[: 8 if self.radial == 6 else 5]
+
+    def free(self) -> tuple[str, ...]:
+        """Those that move."""
+        radial = tuple(f"k{i + 1}" for i in range(self.radial))
+        return tuple(n for n in self.names() if n in radial or (self.tangential and n[0] == "p"))
+
+    def make(self, coefficients: Float[Array, " c"]) -> Lens | None:
+        """The lens with these coefficients."""
+        return BrownConrady(coefficients)
+
+
+class Fisheye(LensModel):
+    """A lens of very wide view, `KannalaBrandt`.
+
+    Attributes:
+        radial: how many of the four coefficients move.
+    """
+
+    radial: int = eqx.field(static=True, default=4)
+
+    def __check_init__(self) -> None:
+        if not 0 <= self.radial <= 4:
+            raise ValueError(f"Fisheye got radial={self.radial}; it must be 0 to 4.")
+
+    def names(self) -> tuple[str, ...]:
+        """Four."""
+        return ("k1", "k2", "k3", "k4")
+
+    def free(self) -> tuple[str, ...]:
+        """The first ones."""
+        return self.names()[: self.radial]
+
+    def make(self, coefficients: Float[Array, " c"]) -> Lens | None:
+        """The lens with these coefficients."""
+        return KannalaBrandt(coefficients)
+
+
+class Intrinsics(eqx.Module):
+    """Which parameters of a camera are looked for.
+
+    Attributes:
+        lens: `Glass`, `Fisheye` or `NoLens`.
+        square_pixels: one focal length for rows and columns.
+        principal_point: whether it moves; otherwise it stays at the center of the pictures.
+        skew: whether it moves; otherwise it is zero.
+
+    Example:
+        >>> Intrinsics(Glass(radial=2, tangential=False), square_pixels=True).free()
+        ('f', 'cx', 'cy', 'k1', 'k2')
+    """
+
+    lens: LensModel = Glass()
+    square_pixels: bool = eqx.field(static=True, default=False)
+    principal_point: bool = eqx.field(static=True, default=True)
+    skew: bool = eqx.field(static=True, default=False)
+
+    def names(self) -> tuple[str, ...]:
+        """All parameters in the order of the tangent of a `Pinhole`: focal lengths, principal point, skew, lens."""
+        return (*_PINHOLE, *self.lens.names())
+
+    def free_pinhole(self) -> tuple[str, ...]:
+        """Those outside the lens that move; ``f`` is both focal lengths."""
+        focal = ("f",) if self.square_pixels else ("fx", "fy")
+        center = ("cx", "cy") if self.principal_point else ()
+        return (*focal, *center, *(("skew",) if self.skew else ()))
+
+    def free(self) -> tuple[str, ...]:
+        """All that move."""
+        return (*self.free_pinhole(), *self.lens.free())
+
+
+class Parametrization(eqx.Module):
+    """The camera as a linear function of what moves, in units that make every unknown a number near one.
+
+    ``parameters = offset + basis @ unknowns``: pixels count in ``scale`` px, so that single precision can tell a step
+    of the focal length from one of a lens.
+
+    Attributes:
+        intrinsics: what moves.
+        offset: parameters where the unknowns are zero: the values of those that stay.
+        scale: px.
+    """
+
+    intrinsics: Intrinsics
+    offset: Float[Array, " p"]
+    scale: Float[Array, ""]
+
+    @staticmethod
+    def of(intrinsics: Intrinsics, center: Float[Array, "2"], scale: Float[Array, ""]) -> "Parametrization":
+        """Of pictures with this center (px), and this extent from it (px)."""
+        offset = jnp.zeros(len(intrinsics.names()), center.dtype).at[2:4].set(center)
+        return Parametrization(intrinsics, offset, scale)
+
+    def basis(self) -> Float[Array, "p u"]:
+        """How parameters move with unknowns."""
+        names, free = self.intrinsics.names(), self.intrinsics.free()
+        pattern = np.zeros((len(names), len(free)))
+        for column, name in enumerate(free):
+            for row in ("fx", "fy") if name == "f" else (name,):
+                pattern[names.index(row), column] = 1.0
+        pixels = np.arange(len(names)) < len(_PINHOLE)
+        units = jnp.where(jnp.asarray(pixels), self.scale, 1.0)
+        return jnp.asarray(pattern, self.scale.dtype) * units[:, None]
+
+    def camera(self, unknowns: Float[Array, " u"]) -> Pinhole:
+        """The camera."""
+        values = self.offset + matmul(self.basis(), unknowns)
+        return Pinhole(*(values[i] for i in range(5)), self.intrinsics.lens.make(values[5:]))
+
+    def start(self, focal: Float[Array, "2"], center: Float[Array, "2"]) -> Float[Array, " u"]:
+        """Unknowns of a camera without lens; what does not move stays where it is."""
+        fx, fy = focal[0] / self.scale, focal[1] / self.scale
+        moved = (center - self.offset[2:4]) / self.scale
+        known: dict[str, Any] = {"f": jnp.sqrt(fx * fy), "fx": fx, "fy": fy, "cx": moved[0], "cy": moved[1]}
+        return jnp.stack([known.get(name, jnp.zeros_like(fx)) for name in self.intrinsics.free()])

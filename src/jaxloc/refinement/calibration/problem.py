@@ -1,0 +1,237 @@
+"""The reprojection errors of boards: unknowns that all pictures share, and a pose for each.
+
+The Jacobian has the shape of an arrow: a picture knows the shared unknowns and its own pose. Derivatives are taken
+forward, picture by picture, in those few directions alone, and put in their places.
+"""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxloc.poses import SE3, retract, tangent_dimension
+from jaxloc.poses.group import matmul
+from jaxloc.refinement.calibration.model import Parametrization
+from jaxloc.sensors import Pinhole
+from jaxloc.solvers import Linearization, Problem, Quadratic
+from jaxloc.solvers.problem import items, with_losses
+
+# Residual, in sigmas, of a corner behind the camera: dear, so that no step hides boards there.
+_UNSEEN = 1e4
+_LEAST_TILT = 0.025  # boards whose normals all lie within this angle of one direction count as parallel, rad
+
+
+class Unknowns(eqx.Module):
+    """What is looked for.
+
+    Attributes:
+        shared: by all pictures.
+        boards: a pose for each picture, ``T_camera_board`` of the (left) camera.
+    """
+
+    shared: Any
+    boards: SE3
+
+
+class Rig(eqx.Module):
+    """What two cameras share over all pictures.
+
+    Attributes:
+        left: unknowns of the left camera.
+        right: of the right one.
+        T_left_right: pose of the right camera in the left one's frame.
+    """
+
+    left: Float[Array, " u"]
+    right: Float[Array, " v"]
+    T_left_right: SE3
+
+
+class BoardProblem(Problem):
+    """Boards with a pose each; subclasses say what one board looks like.
+
+    The residual is a pair: pixel errors, and for pictures that do not count the way from the pose at rest, which keeps
+    the normal equations regular.
+
+    Attributes:
+        board: "3 m", m.
+        pixels: "n 2 k", px; k corners a picture, of all cameras.
+        valid: those that count.
+        sigma: of a coordinate of a corner, px.
+    """
+
+    board: eqx.AbstractVar[Float[Array, "3 m"]]
+    pixels: eqx.AbstractVar[Float[Array, "n 2 k"]]
+    valid: eqx.AbstractVar[Bool[Array, "n k"]]
+    sigma: eqx.AbstractVar[Float[Array, ""]]
+
+    @abstractmethod
+    def predict(self, shared: Any, pose: SE3) -> tuple[Float[Array, "2 k"], Bool[Array, " k"]]:
+        """Pixels of the corners of one board, and which are ahead of the cameras."""
+
+    @property
+    @abstractmethod
+    def num_pinhole(self) -> int:
+        """How many unknowns outside the lens the boards have to tell."""
+
+    @abstractmethod
+    def sensible(self, shared: Any) -> Bool[Array, ""]:
+        """Whether the shared unknowns make a camera."""
+
+    def one(self, shared: Any, pose: SE3, pixels: Float[Array, "2 k"], valid: Bool[Array, " k"]) -> tuple[Array, Array]:
+        """Residual of one board."""
+        shown, ahead = self.predict(shared, pose)
+        error = jnp.where((valid & ahead)[None, :], shown - pixels, 0.0) / self.sigma
+        dear = jnp.where(valid & ~ahead, _UNSEEN, 0.0).astype(error.dtype)
+        return error + dear[None, :], jnp.where(jnp.any(valid), 0.0, _way_from_rest(pose))
+
+    def residual(self, state: Unknowns) -> tuple[Float[Array, "2 i"], Float[Array, "6 n"]]:
+        """Whitened errors of all boards."""
+        errors, idle = jax.vmap(self.one, (None, 0, 0, 0))(state.shared, state.boards, self.pixels, self.valid)
+        return _flat(errors), idle.T
+
+    def linearize(self, state: Unknowns) -> Linearization:
+        """Residual and Jacobian, picture by picture."""
+        shared = tangent_dimension(state.shared)
+
+        def local(pose: SE3, pixels: Array, valid: Array) -> tuple[Any, Any]:
+            def moved(delta: Array) -> tuple[Array, Array]:
+                return self.one(retract(state.shared, delta[:shared]), pose.retract(delta[shared:]), pixels, valid)
+
+            zero = jnp.zeros(shared + SE3.dof, self.sigma.dtype)
+            value, push = jax.linearize(moved, zero)
+            return value, jax.vmap(push)(jnp.eye(zero.size, dtype=zero.dtype))
+
+        (errors, idle), (slopes, idle_slopes) = jax.vmap(local)(state.boards, self.pixels, self.valid)
+        jacobian = _arrow(slopes, shared), _arrow(idle_slopes[..., None], shared)
+        return Linearization((_flat(errors), idle.T), jacobian)
+
+    def hessian(self, state: Unknowns) -> Float[Array, "d d"]:
+        """Exact Hessian at a minimum, picture by picture."""
+        shared, count = tangent_dimension(state.shared), self.pixels.shape[0]
+
+        def local(pose: SE3, pixels: Array, valid: Array) -> Array:
+            def cost(delta: Array) -> Array:
+                parts = self.one(retract(state.shared, delta[:shared]), pose.retract(delta[shared:]), pixels, valid)
+                costs = [
+                    jnp.sum(kernel.rho(jnp.sum(items(r) ** 2, axis=0)))
+                    for kernel, r in with_losses(self.loss, (parts[0], parts[1][:, None]))
+                ]
+                return costs[0] + costs[1]
+
+            return jax.hessian(cost)(jnp.zeros(shared + SE3.dof, self.sigma.dtype))
+
+        blocks = jax.vmap(local)(state.boards, self.pixels, self.valid)
+        corner = jnp.sum(blocks[:, :shared, :shared], axis=0)
+        side = jnp.swapaxes(blocks[:, shared:, :shared], 0, 1)
+        side = jnp.swapaxes(side, 0, 1).reshape(count * SE3.dof, shared)
+        own = jnp.eye(count, dtype=corner.dtype)[:, None, :, None] * blocks[:, shared:, shared:][:, :, None, :]
+        return jnp.block([[corner, side.T], [side, own.reshape(count * SE3.dof, -1)]])
+
+    def admissible(self, state: Unknowns) -> Bool[Array, ""]:
+        """Whether the cameras are sensible, every corner is ahead of them, and the boards can tell the unknowns.
+
+        A board tells two numbers of a camera [T-17]; parallel boards tell the same two.
+        """
+        _, ahead = jax.vmap(self.predict, (None, 0))(state.shared, state.boards)
+        views = jnp.where(tilted(state.boards, self.valid), jnp.sum(jnp.any(self.valid, axis=1)), 1)
+        enough = 2 * views >= self.num_pinhole
+        return self.sensible(state.shared) & jnp.all(ahead | ~self.valid) & enough
+
+
+class CameraProblem(BoardProblem):
+    """Boards before one camera; shared are its unknowns."""
+
+    parametrization: Parametrization
+    board: Float[Array, "3 m"]
+    pixels: Float[Array, "n 2 m"]
+    valid: Bool[Array, "n m"]
+    sigma: Float[Array, ""]
+    loss: Any = Quadratic()
+
+    def predict(self, shared: Any, pose: SE3) -> tuple[Float[Array, "2 m"], Bool[Array, " m"]]:
+        """Pixels of the corners of one board, and which are ahead of the camera."""
+        return project(self.parametrization.camera(shared), pose, self.board)
+
+    @property
+    def num_pinhole(self) -> int:
+        """How many unknowns outside the lens the boards have to tell."""
+        return len(self.parametrization.intrinsics.free_pinhole())
+
+    def sensible(self, shared: Any) -> Bool[Array, ""]:
+        """Whether focal lengths are positive."""
+        return _positive(self.parametrization.camera(shared))
+
+
+class StereoProblem(BoardProblem):
+    """Boards before two cameras; shared is a `Rig`. Corners of the right picture follow those of the left one."""
+
+    left: Parametrization
+    right: Parametrization
+    board: Float[Array, "3 m"]
+    pixels: Float[Array, "n 2 k"]
+    valid: Bool[Array, "n k"]
+    sigma: Float[Array, ""]
+    loss: Any = Quadratic()
+
+    def predict(self, shared: Any, pose: SE3) -> tuple[Float[Array, "2 k"], Bool[Array, " k"]]:
+        """Pixels of the corners of one board, and which are ahead of the cameras."""
+        shown, ahead = project(self.left.camera(shared.left), pose, self.board)
+        other = shared.T_left_right.inverse() @ pose
+        shown_right, ahead_right = project(self.right.camera(shared.right), other, self.board)
+        return jnp.concatenate([shown, shown_right], axis=1), jnp.concatenate([ahead, ahead_right])
+
+    @property
+    def num_pinhole(self) -> int:
+        """How many unknowns outside the lens the boards have to tell of one camera."""
+        return max(len(side.intrinsics.free_pinhole()) for side in (self.left, self.right))
+
+    def sensible(self, shared: Any) -> Bool[Array, ""]:
+        """Whether focal lengths are positive."""
+        return _positive(self.left.camera(shared.left)) & _positive(self.right.camera(shared.right))
+
+
+def project(camera: Pinhole, pose: SE3, board: Float[Array, "3 m"]) -> tuple[Float[Array, "2 m"], Bool[Array, " m"]]:
+    """Pixels of points of a board at ``T_camera_board``, and which are ahead of the camera."""
+    moved = matmul(pose.rotation.matrix(), board) + pose.translation[:, None]
+    ahead = moved[2] > 0.0
+    depth = jnp.where(ahead, moved[2], 1.0)
+    x, y = jnp.where(ahead, moved[0], 0.0), jnp.where(ahead, moved[1], 0.0)
+    return jnp.stack(camera.project_components(x, y, depth)), ahead
+
+
+def tilted(boards: SE3, valid: Bool[Array, "n k"]) -> Bool[Array, ""]:
+    """Whether the normals of the boards differ."""
+    used = jnp.any(valid, axis=1)
+    normals = jnp.where(used[:, None], boards.rotation.rotation_matrix[:, :, 2], 0.0)
+    count = jnp.maximum(jnp.sum(used), 1).astype(normals.dtype)
+    largest = jnp.linalg.norm(jnp.sum(normals, axis=0)) / count
+    return largest < 1.0 - 0.5 * _LEAST_TILT**2
+
+
+def _way_from_rest(pose: SE3) -> Float[Array, "6"]:
+    """Zero at the identity with unit derivative, and smooth everywhere, which the logarithm is not."""
+    r = pose.rotation.rotation_matrix
+    turn = 0.5 * jnp.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    return jnp.concatenate([pose.translation, turn])
+
+
+def _positive(camera: Pinhole) -> Bool[Array, ""]:
+    return (camera.fx > 0) & (camera.fy > 0)
+
+
+def _flat(errors: Float[Array, "n 2 k"]) -> Float[Array, "2 i"]:
+    return jnp.swapaxes(errors, 0, 1).reshape(2, -1)
+
+
+def _arrow(slopes: Float[Array, "n d c k"], shared: int) -> Float[Array, "w c i"]:
+    """Derivatives of each picture in its place: shared directions first, then six for each pose."""
+    count, _, components, size = slopes.shape
+    common = jnp.moveaxis(slopes[:, :shared], 0, 2).reshape(shared, components, count * size)
+    eye = jnp.eye(count, dtype=slopes.dtype)
+    own = eye[:, None, None, :, None] * slopes[:, shared:, :, None, :]
+    own = own.reshape(count * SE3.dof, components, count * size)
+    return jnp.concatenate([common, own])

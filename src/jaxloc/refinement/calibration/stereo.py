@@ -1,0 +1,145 @@
+"""Two cameras that are fixed to each other, from pictures of a flat board that both may see."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxloc.poses import SE3, SO3
+from jaxloc.poses.group import matmul
+from jaxloc.refinement.calibration.camera import carried, check_corners, fit, prepare
+from jaxloc.refinement.calibration.model import Intrinsics
+from jaxloc.refinement.calibration.problem import CameraProblem, Rig, StereoProblem, Unknowns
+from jaxloc.refinement.calibration.start import safe_views
+from jaxloc.sensors import Pinhole
+from jaxloc.solvers import Estimate, LevenbergMarquardt, Quadratic, solve
+
+
+class Corners(eqx.Module):
+    """Corners of a board in the pictures of one camera.
+
+    Attributes:
+        pixels: px.
+        valid: corners that count; None for all. Those that are not finite never do.
+    """
+
+    pixels: Float[Array, "boards corners 2"]
+    valid: Bool[Array, "boards corners"] | None = None
+
+
+class CalibratedStereo(eqx.Module):
+    """Two calibrated cameras and where the boards were.
+
+    Attributes:
+        left: the left camera.
+        right: the right camera.
+        T_left_right: pose of the right camera in the left one's frame.
+        T_left_board: a pose for each pair of pictures.
+    """
+
+    left: Pinhole
+    right: Pinhole
+    T_left_right: SE3
+    T_left_board: SE3
+
+
+@eqx.filter_jit
+def calibrate_stereo(
+    board: Float[Array, "corners 3"],
+    left: Corners,
+    right: Corners,
+    *,
+    intrinsics: Intrinsics = Intrinsics(),
+    shape: tuple[int, int] | None = None,
+    sigma: Any = None,
+    loss: Any = Quadratic(),
+) -> Estimate:
+    """Two cameras, and the pose of one in the frame of the other, from pictures of a flat board.
+
+    Minimizes the whitened reprojection errors of both cameras over both cameras, ``T_left_right`` and the poses
+    ``T_left_board`` together: see `calibrate`, and the precision that it asks for. A pair in which only one camera sees
+    the board still tells about that camera.
+
+    Args:
+        board: corners in the frame of the board, m, with z = 0.
+        left: where they appear in each picture of the left camera.
+        right: where they appear in the picture of the right camera at the same instant.
+        intrinsics: which parameters are looked for, of either camera.
+        shape: (rows, columns) of the pictures, for the start, and for a principal point that stays.
+        sigma: standard deviation of a coordinate of a corner, px; None takes it from the residuals.
+        loss: robust kernel over the two coordinates of a corner, in sigmas.
+
+    Returns:
+        Estimate of a `CalibratedStereo`; the tangent is that of the left camera, the right camera, ``T_left_right``,
+        and the boards.
+
+    Raises:
+        ValueError: if the numbers of corners of board and pictures differ.
+
+    References:
+        Zhang 2000 [T-17]; the rig of thesis figure 2.4 [T-21].
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxloc as jl
+        >>> from jaxloc.refinement.calibration import Corners, Intrinsics, NoLens, calibrate_stereo
+        >>> board = jnp.array([[0.1 * x, 0.1 * y, 0.0] for y in range(4) for x in range(5)])
+        >>> camera, rig = jl.sensors.Pinhole(500.0, 500.0, 320.0, 240.0), jl.poses.SE3.exp(jnp.eye(6)[0] * 0.1)
+        >>> def view(angles):
+        ...     pose = jl.poses.SE3.from_euler(jnp.array([-0.2, -0.1, 1.0]), angles[0], angles[1], angles[2])
+        ...     right = rig.inverse() @ pose
+        ...     return camera.project(pose.apply(board)), camera.project(right.apply(board))
+        >>> angles = jnp.array([[0.0, 0.3, 0.2], [0.2, -0.4, 0.1], [0.4, 0.1, -0.5], [0.1, -0.2, 0.4]])
+        >>> pictures = [Corners(side) for side in jax.vmap(view)(angles)]
+        >>> fit = calibrate_stereo(board, *pictures, intrinsics=Intrinsics(NoLens()), sigma=0.1)
+        >>> bool(fit.ok), round(float(fit.value.T_left_right.translation[0]), 3)
+        (True, 0.1)
+    """
+    check_corners(board, left.pixels, right.pixels)
+    sides = [prepare(safe_views(board, side.pixels, side.valid), intrinsics, shape, loss) for side in (left, right)]
+    (left_model, left_problem, _), (right_model, right_problem, _) = sides
+    alone = [_alone(problem, start) for _, problem, start in sides]
+    start = _join(alone, [left_problem.valid, right_problem.valid])
+    problem = StereoProblem(
+        left_model,
+        right_model,
+        left_problem.board,
+        jnp.concatenate([left_problem.pixels, right_problem.pixels], axis=2),
+        jnp.concatenate([left_problem.valid, right_problem.valid], axis=1),
+        left_problem.sigma,
+        loss,
+    )
+    found = fit(problem, start, sigma, LevenbergMarquardt())
+    rig = found.value.shared
+    value = CalibratedStereo(
+        left_model.camera(rig.left), right_model.camera(rig.right), rig.T_left_right, found.value.boards
+    )
+    return carried(found, value, left_model.basis(), right_model.basis())
+
+
+def _alone(problem: CameraProblem, start: Unknowns) -> Unknowns:
+    """One camera by itself, as a start."""
+    frozen = jax.lax.stop_gradient(problem)
+    plain = eqx.tree_at(lambda p: p.loss, frozen, Quadratic())
+    return solve(plain, start, solver=LevenbergMarquardt(), max_steps=100).value
+
+
+def _join(alone: list[Unknowns], valid: list[Array]) -> Unknowns:
+    """The rig that the boards seen by both agree on in the mean, and all boards in the left camera's frame."""
+    left, right = (unknowns.boards for unknowns in alone)
+    seen_left, seen_right = (jnp.any(mask, axis=1) for mask in valid)
+    both = (seen_left & seen_right).astype(left.translation.dtype)
+    relative = jax.vmap(lambda a, b: a @ b.inverse())(left, right)
+    count = jnp.maximum(jnp.sum(both), 1.0)
+    rotation = jnp.sum(relative.rotation.rotation_matrix * both[:, None, None], axis=0) / count
+    u, _, v = jnp.linalg.svd(jnp.where(jnp.sum(both) > 0, rotation, jnp.eye(3, dtype=rotation.dtype)))
+    mean = SE3(SO3(matmul(u, v)), jnp.sum(relative.translation * both[:, None], axis=0) / count)
+    carried_over = jax.vmap(lambda b: mean @ b)(right)
+    only_right = ~seen_left & seen_right
+
+    def choose(a: Array, b: Array) -> Array:
+        return jnp.where(only_right.reshape(-1, *([1] * (a.ndim - 1))), b, a)
+
+    boards = jax.tree.map(choose, left, carried_over)
+    return Unknowns(Rig(alone[0].shared, alone[1].shared, mean), boards)
