@@ -151,12 +151,16 @@ def follow(trip: RoadDrive, views: list[GroundView], adaptation: ralph.Adaptatio
     template = ralph.capture(views[0], fit)
     interval = trip.times[1] - trip.times[0]
     for view, lane, speed, yaw_rate in zip(views, trip.lanes, trip.speeds, trip.yaw_rates, strict=True):
-        near = ralph.Hypotheses.around(fit, curvature=4e-4, heading=0.012, pitch=0.006, offset=0.4, counts=(9, 7, 5))
-        found = ralph.estimate(view, template, hypotheses=near)
-        fit = jax.tree.map(lambda new, old, ok=found.ok: jnp.where(ok, new, old), found.estimate.value, fit)
+        tried = ralph.Hypotheses.around(fit, curvature=4e-4, heading=0.012, pitch=0.006, offset=0.4, counts=(9, 7, 5))
+        found = ralph.estimate(view, template, hypotheses=tried)
+        value = found.estimate.value
+        # A lane does not jump: what is far from the prediction belongs to something else.
+        near = (abs(value.offset - fit.offset) < 0.15) & (abs(value.heading - fit.heading) < 0.01)
+        ok = found.ok & near
+        fit = jax.tree.map(lambda new, old, ok=ok: jnp.where(ok, new, old), value, fit)
         template = adaptation.adapt(template, view, fit, jnp.array(True))
         errors.append(float(fit.offset) - lane[0])
-        believed.append(bool(found.ok))
+        believed.append(bool(ok))
         later = fit.lane().advance(jnp.float32(speed * interval), jnp.float32(yaw_rate * interval))
         fit = ralph.LaneFit(later.offset, later.heading, later.curvature, fit.pitch)
     return np.abs(errors), np.array(believed)

@@ -117,19 +117,27 @@ def _see(
     return ralph.estimate(view, bank, hypotheses=tried, pitch_sigma=tracker.pitch_sigma)
 
 
+@eqx.filter_jit
 def _propose(tracker: Tracker, image: Float[Array, "h w"], bank: ralph.Template) -> GaussianState:
-    """RALPH's lane as a wide prior, whether RALPH believes it or not: the borders will tell."""
-    seen = _see(tracker, image, bank, ralph.Hypotheses.around(_nothing(tracker)))
-    return _as_prior(tracker, seen, jnp.ones_like(tracker.width))
+    """RALPH's search as a wide prior, without its fit.
+
+    Where only one side shows paint, a painted template fits with a wrong pitch as well.
+    """
+    view = look(tracker.ground, image, tracker.grid)
+    tried = ralph.Hypotheses.around(_nothing(tracker))
+    rough = ralph.find_straightest(view, tried).fit
+    profile = ralph.straighten(view, rough, bank.left[0]).profile()
+    match = ralph.match_profile(profile, bank, around=tried.offset, reach=tried.reach)
+    share = jnp.array(_WIDTHS, image.dtype)[match.which] / _WIDTHS[2]
+    lane = Lane(match.offset, rough.heading, rough.curvature, jnp.zeros_like(match.offset))
+    return _start(tracker, RoadState(lane, tracker.width * share, rough.pitch), jnp.ones_like(tracker.width))
 
 
 @eqx.filter_jit
-def _as_prior(tracker: Tracker, seen: ralph.LaneState, scale: Float[Array, ""]) -> GaussianState:
-    fit = seen.estimate.value
-    good = jnp.all(jnp.isfinite(jnp.stack([fit.offset, fit.heading, fit.curvature, fit.pitch])))
-    fit = jax.tree.map(lambda leaf: jnp.where(good, leaf, 0.0), fit)
-    share = jnp.array(_WIDTHS, scale.dtype)[seen.template] / _WIDTHS[2]
-    return _start(tracker, RoadState(fit.lane(), tracker.width * share, fit.pitch), scale)
+def _as_prior(tracker: Tracker, seen: ralph.LaneState) -> GaussianState:
+    """A lane that RALPH recognized, with a narrow prior of its own."""
+    fit = jax.tree.map(lambda leaf: jnp.where(seen.ok, leaf, 0.0), seen.estimate.value)
+    return _start(tracker, RoadState(fit.lane(), tracker.width, fit.pitch), jnp.full_like(tracker.width, 0.3))
 
 
 def _nothing(tracker: Tracker) -> ralph.LaneFit:
@@ -194,9 +202,7 @@ def recognize(tracker: Tracker, image: Float[Array, "h w"], template: ralph.Temp
         template: what the road looks like.
     """
     seen = _see(tracker, image, _alone(template), ralph.Hypotheses.around(_nothing(tracker)))
-    state = _as_prior(tracker, seen, jnp.full_like(tracker.width, 0.3))
-    mean = eqx.tree_at(lambda m: m.width, state.mean, tracker.width)
-    return _by_template(eqx.tree_at(lambda s: s.mean, state, mean), seen, seen.ok)
+    return _by_template(_as_prior(tracker, seen), seen, seen.ok)
 
 
 def _by_template(state: GaussianState, seen: ralph.LaneState, ok: Bool[Array, ""]) -> Moved:

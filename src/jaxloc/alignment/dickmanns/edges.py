@@ -114,7 +114,7 @@ def find_edge(
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> left = jnp.linspace(0.6, -0.6, 61)
-        >>> profile = 80.0 + 50.0 * (jnp.abs(left - 0.2) < 0.061)
+        >>> profile = jnp.where(jnp.abs(left - 0.2) < 0.061, 130.0, 80.0)
         >>> edge = jl.alignment.dickmanns.find_edge(profile, jnp.array(1.0), jnp.array(0.6))
         >>> round(float(edge.place), 2), bool(edge.ok)
         (0.2, True)

@@ -68,11 +68,13 @@ class Trust(eqx.Module):
         correlation: least correlation of profile and template.
         rival: greatest correlation of another place, as a share of the best.
         noise: greatest spread of what the fit leaves, of normalized rows.
+        move: greatest way of the fit's offset from where the profile matched, m.
     """
 
     correlation: float = 0.5
     rival: float = 0.85
     noise: float = 1.2
+    move: float = 0.8
 
 
 @eqx.filter_jit
@@ -119,6 +121,7 @@ def estimate(
     sigma = jnp.asarray(pitch_sigma, view.image.dtype)
     fit = refine(view, chosen, start, pitch_sigma=sigma, kernel=kernel)
     ambiguous = match.sidelobe > trust.rival * match.correlation
-    ok = fit.estimate.ok & (match.correlation > trust.correlation) & (fit.noise < trust.noise) & ~ambiguous
+    stayed = jnp.abs(fit.estimate.value.offset - match.offset) < trust.move
+    ok = fit.estimate.ok & stayed & (match.correlation > trust.correlation) & (fit.noise < trust.noise) & ~ambiguous
     result = eqx.tree_at(lambda e: e.ok, fit.estimate, ok)
     return LaneState(result, match.confidence(), ambiguous, match.which, match)

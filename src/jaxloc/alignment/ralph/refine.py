@@ -36,27 +36,30 @@ class TemplateResidual(Problem):
         template: what it should look like across.
         noise: s, spread of the difference of normalized rows.
         pitch_sigma: how well the pitch of the view is known, rad.
-        loss: robust kernel of a single position, since dashes, cars and shadows are not in the template; and that of
-            the pitch.
+        loss: robust kernel of a single position, since dashes, cars and shadows are not in the template; and those of
+            what is not seen and of the pitch.
     """
 
     view: GroundView
     template: Template
     noise: Float[Array, ""]
     pitch_sigma: Float[Array, ""]
-    loss: tuple[Loss, Loss]
+    loss: tuple[Loss, Loss, Loss]
 
-    def residual(self, state: LaneFit) -> tuple[Array, Array]:
-        """Whitened differences, one component by item."""
-        difference = self.differences(state) / self.noise
-        return difference.reshape(1, -1), (state.pitch / self.pitch_sigma).reshape(1, 1)
+    def residual(self, state: LaneFit) -> tuple[Array, Array, Array]:
+        """Whitened differences, what is not seen, and the pitch; one component by item."""
+        difference, weight = self.differences(state)
+        # Looking away must not pay: a position that is not seen costs what one that fits costs.
+        missing = 1.0 - weight
+        pitch = state.pitch / self.pitch_sigma
+        return (difference / self.noise).reshape(1, -1), missing.reshape(1, -1), pitch.reshape(1, 1)
 
-    def differences(self, state: LaneFit) -> Float[Array, "rows columns"]:
-        """Normalized rows less the template, zero where either is unknown."""
+    def differences(self, state: LaneFit) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
+        """Normalized rows less the template, times their weight, and the weight: zero where either is unknown."""
         values, weight = shift_rows(self.view, state, self.template.left)
         rows = normalize_rows(values, jnp.where(self.template.known[None, :], weight, 0.0))
         model = normalize_rows(jnp.broadcast_to(self.template.values, values.shape), rows.weight)
-        return model.weight * (rows.values - model.values)
+        return model.weight * (rows.values - model.values), model.weight
 
 
 class Refined(eqx.Module):
@@ -92,7 +95,7 @@ def refine(
             step that it leaves out is far below the standard deviation.
 
     Returns:
-        The fit; derivatives are those of the minimum.
+        The fit; derivatives are those of the minimum, with the scale of the noise held.
     """
     kernel = Tukey(10.0) if kernel is None else kernel
     views, templates = [view], [template]
@@ -114,13 +117,15 @@ def _problem(
     view: GroundView, template: Template, start: LaneFit, pitch_sigma: Float[Array, ""], kernel: Loss
 ) -> TemplateResidual:
     """The problem with the noise that its start shows."""
-    problem = TemplateResidual(view, template, jnp.ones_like(pitch_sigma), pitch_sigma, (kernel, Quadratic()))
-    return eqx.tree_at(lambda p: p.noise, problem, _spread(problem, start))
+    problem = TemplateResidual(
+        view, template, jnp.ones_like(pitch_sigma), pitch_sigma, (kernel, Quadratic(), Quadratic())
+    )
+    return eqx.tree_at(lambda p: p.noise, problem, lax.stop_gradient(_spread(problem, start)))
 
 
 def _spread(problem: TemplateResidual, state: LaneFit) -> Float[Array, ""]:
     """Standard deviation of the differences as their mean absolute value tells it: few large ones do not matter."""
-    difference = problem.differences(state)
+    difference, _ = problem.differences(state)
     count = jnp.maximum(jnp.sum(difference != 0.0), 1).astype(difference.dtype)
     return jnp.maximum(1.2533 * jnp.sum(jnp.abs(difference)) / count, _SMALLEST_NOISE)
 
@@ -141,7 +146,7 @@ def _jackknife(problem: TemplateResidual, state: LaneFit) -> Float[Array, "4 4"]
     residual, jacobian = linear.residual[0][0], linear.jacobian[0][:, 0]
     weight = problem.loss[0].weight(residual**2)
     weighted = jacobian * weight[None, :]
-    prior = linear.jacobian[1].reshape(4, -1)
+    prior = linear.jacobian[2].reshape(4, -1)
     whole = matmul(weighted, jacobian.T) + matmul(prior, prior.T)
 
     def move(member: Array) -> Array:

@@ -143,7 +143,7 @@ class Predictive(Adaptation):
     near: Float[Array, ""]
     rate: Float[Array, ""]
 
-    def __init__(self, near: Any = 25.0, rate: Any = 0.3):
+    def __init__(self, near: Any = 12.0, rate: Any = 0.1):
         self.near, self.rate = as_floats(near, rate)
 
     def adapt(self, template: Template, view: GroundView, fit: LaneFit, ok: Bool[Array, ""]) -> Template:

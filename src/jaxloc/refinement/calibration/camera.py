@@ -52,7 +52,7 @@ def calibrate(
     the poses are uncertain too.
 
     Focal length and distance, principal point and tilt, and the coefficients of a lens are almost exchangeable: use
-    float64 (``jax.enable_x64``). In float32 the values are right to about a tenth of their standard deviations where
+    float64 (``jax.enable_x64``). In float32 the values are right to about a fifth of their standard deviations where
     the data are good; a nearly singular problem is reported as not ok earlier than in float64.
 
     Args:
