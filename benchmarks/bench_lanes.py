@@ -34,14 +34,15 @@ class Errors(NamedTuple):
 
 def metrics(smoke: bool) -> Iterator[Metric]:
     count = 4 if smoke else 60
-    for name, road, pitch in (
+    scenes = (
         ("marks", Road(), 0.0),
         ("no_marks", Road().without_marks(), 0.0),
         ("pitch_wrong", Road(), np.deg2rad(0.5)),
-    ):
+    )
+    for name, road, pitch in scenes[:1] if smoke else scenes:
         yield from _accuracy(f"lanes.{name}", road, pitch, count)
-    yield from _time(2 if smoke else 20, 4 if smoke else 256)
-    yield from _adaptation(6 if smoke else 160)
+    yield from _time(2 if smoke else 20, 2 if smoke else 256)
+    yield from _adaptation(4 if smoke else 160)
 
 
 def view_of(picture: np.ndarray, wrong_pitch: float = 0.0) -> GroundView:
