@@ -112,7 +112,8 @@ def find_straightest(
     small = view
     for _ in range(_LEVEL):
         small = small.coarser()
-    scores = jax.vmap(lambda pitch: _scores_at(small, hypotheses, pitch, sharpness))(hypotheses.pitches)
+    # In turn: the slices of all hypotheses at once would not fit the cache, of a batch of roads not the memory.
+    scores = lax.map(lambda pitch: _scores_at(small, hypotheses, pitch, sharpness), hypotheses.pitches)
     best = jnp.argmax(scores)
     p, h, c = jnp.unravel_index(best, scores.shape)
     fit = LaneFit(
@@ -133,7 +134,7 @@ def _scores_at(view: GroundView, hypotheses: Hypotheses, pitch: Array, sharpness
         return sharpness.score(_sum_slices(level, -center / spacing))
 
     by_curvature = jax.vmap(score, in_axes=(None, 0))
-    return jax.vmap(by_curvature, in_axes=(0, None))(hypotheses.headings, hypotheses.curvatures)
+    return lax.map(lambda heading: by_curvature(heading, hypotheses.curvatures), hypotheses.headings)
 
 
 def _sum_slices(level: Float[Array, "rows columns"], shift: Float[Array, " rows"]) -> Profile:
