@@ -113,8 +113,11 @@ def _time(repeats: int, batch: int) -> Iterator[Metric]:
         yield Metric(f"{key}.cpu", 1e3 * best.cpu, "ms", "lower", TIME)
     views = jax.vmap(lambda shift: look(GROUND, picture + shift, grid))(jnp.linspace(0.0, 9.0, batch))
     together = jax.jit(jax.vmap(ralph.estimate, in_axes=(0, None)))
-    best = quickest(lambda: together(views, template), 3)
+    best = quickest(lambda: together(views, template), 1)
     yield Metric("lanes.batch", 1e3 * best.wall / batch, f"ms a road, {batch} under vmap", "lower", TIME)
+    one_by_one = jax.jit(lambda views, template: jax.lax.map(lambda view: ralph.estimate(view, template), views))
+    best = quickest(lambda: one_by_one(views, template), 1)
+    yield Metric("lanes.map", 1e3 * best.wall / batch, f"ms a road, {batch} under lax.map", "lower", TIME)
 
 
 def _adaptation(frames: int) -> Iterator[Metric]:
