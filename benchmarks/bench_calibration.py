@@ -130,6 +130,8 @@ def _simulated(trials: int) -> Iterator[Metric]:
         return error @ jnp.linalg.solve(found.covariance[np.ix_(free, free)], error), fit.ok
 
     noise = jnp.asarray(_SIGMA * rng.normal(size=(trials, *corners.shape)))
-    squared, ok = jax.jit(jax.vmap(trial))(noise)
-    yield Metric("calibration.simulated.ok", float(jnp.mean(ok)), "share", "higher", 0.01)
-    yield Metric("calibration.simulated.nees", float(jnp.mean(squared)), "of 8", "equal", ACCURACY)
+    # One by one: XLA's pool of CPU threads can lock up on large programs with LAPACK calls under vmap.
+    each = jax.jit(trial)
+    squared, ok = zip(*[each(one) for one in noise], strict=True)
+    yield Metric("calibration.simulated.ok", float(np.mean(ok)), "share", "higher", 0.01)
+    yield Metric("calibration.simulated.nees", float(np.mean(squared)), "of 8", "equal", ACCURACY)

@@ -119,5 +119,7 @@ plt.show()
 # - The pitch belongs to the unknowns: half a degree would bend a straight road.
 # - A profile that repeats itself is said to be ambiguous, and a road like no template is not believed.
 #
-# **Next steps:** `jaxloc lane VIDEO --camera CAMERA.yaml` follows a lane through a recording; notebook 11 does on a
+# ## Next steps
+#
+# `jaxloc lane VIDEO --camera CAMERA.yaml` follows a lane through a recording; notebook 11 does on a
 # factory's floor what this one does on a road.

