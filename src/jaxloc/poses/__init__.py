@@ -1,7 +1,8 @@
 """Where things are: rotations, poses, and moving any pytree along a tangent."""
 
-from jaxloc.poses import compound, manifold, planar, rotation, se2, se3, series, trajectory
-from jaxloc.poses.group import Group
+from jaxloc.poses import compound, direction, manifold, planar, rotation, se2, se3, series, trajectory
+from jaxloc.poses.direction import Direction
+from jaxloc.poses.group import Group, Manifold
 from jaxloc.poses.manifold import carry, is_flat, local, retract, tangent_dimension, tangent_labels
 from jaxloc.poses.rotation import SO2, SO3, wrap_angle
 from jaxloc.poses.se2 import SE2
@@ -13,11 +14,14 @@ __all__ = [
     "SE3",
     "SO2",
     "SO3",
+    "Direction",
     "Group",
+    "Manifold",
     "Trajectory",
     "carry",
     "chain",
     "compound",
+    "direction",
     "interpolate",
     "is_flat",
     "local",

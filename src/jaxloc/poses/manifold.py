@@ -1,4 +1,4 @@
-"""Moving any pytree along a flat tangent vector: poses by their group, arrays by addition."""
+"""Moving any pytree along a flat tangent vector: poses and directions by their own rules, arrays by addition."""
 
 from typing import Any
 
@@ -7,19 +7,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxloc.poses.group import Group
+from jaxloc.poses.group import Manifold
 
 
-def _is_group(node: Any) -> bool:
-    return isinstance(node, Group)
+def _is_manifold(node: Any) -> bool:
+    return isinstance(node, Manifold)
 
 
 def _moves(node: Any) -> bool:
-    return _is_group(node) or eqx.is_inexact_array(node)
+    return _is_manifold(node) or eqx.is_inexact_array(node)
 
 
 def _dimension(node: Any) -> int:
-    if _is_group(node):
+    if _is_manifold(node):
         count = node.dof
         for size in node.batch_shape:
             count *= size
@@ -28,7 +28,7 @@ def _dimension(node: Any) -> int:
 
 
 def _leaves(value: Any) -> list[Any]:
-    return [node for node in jax.tree.leaves(value, is_leaf=_is_group) if _moves(node)]
+    return [node for node in jax.tree.leaves(value, is_leaf=_is_manifold) if _moves(node)]
 
 
 def tangent_dimension(value: Any) -> int:
@@ -51,11 +51,11 @@ def tangent_labels(value: Any) -> tuple[str, ...]:
         ('x', 'y', 'rotation')
     """
     names: list[str] = []
-    for path, node in jax.tree.leaves_with_path(value, is_leaf=_is_group):
+    for path, node in jax.tree.leaves_with_path(value, is_leaf=_is_manifold):
         if not _moves(node):
             continue
         prefix = jax.tree_util.keystr(path, simple=True, separator=".")
-        inner = node.labels if _is_group(node) else ()
+        inner = node.labels if _is_manifold(node) else ()
         count = _dimension(node) // max(len(inner), 1)
         for i in range(count):
             suffix = f"[{i}]" if count > 1 else ""
@@ -92,7 +92,7 @@ def retract(value: Any, delta: Float[Array, " d"]) -> Any:
     needed = tangent_dimension(value)
     if delta.shape[0] != needed:
         raise ValueError(f"The tangent has {delta.shape[0]} entries, but this value moves in {needed} directions.")
-    nodes, structure = jax.tree.flatten(value, is_leaf=_is_group)
+    nodes, structure = jax.tree.flatten(value, is_leaf=_is_manifold)
     start, moved = 0, []
     for node in nodes:
         if not _moves(node):
@@ -100,7 +100,7 @@ def retract(value: Any, delta: Float[Array, " d"]) -> Any:
             continue
         part = delta[start : start + _dimension(node)]
         start += _dimension(node)
-        if _is_group(node):
+        if _is_manifold(node):
             part = part.reshape(*node.batch_shape, node.dof)
             moved.append(_over_stack(lambda pose, d: pose.retract(d), len(node.batch_shape))(node, part))
         else:
@@ -125,7 +125,7 @@ def local(value: Any, other: Any) -> Float[Array, " d"]:
     """
     parts = []
     for a, b in zip(_leaves(value), _leaves(other), strict=True):
-        if _is_group(a):
+        if _is_manifold(a):
             parts.append(_over_stack(lambda pose, o: pose.local(o), len(a.batch_shape))(a, b).reshape(-1))
         else:
             parts.append((b - a).reshape(-1))
@@ -142,7 +142,7 @@ def is_flat(value: Any) -> bool:
         >>> jl.poses.is_flat(jnp.zeros(3)), jl.poses.is_flat(jl.poses.SE2(0.0, 0.0, 0.0))
         (True, False)
     """
-    return not any(_is_group(node) for node in _leaves(value))
+    return not any(_is_manifold(node) for node in _leaves(value))
 
 
 def carry(value: Any, delta: Float[Array, " d"], target: Any) -> Float[Array, "d d"]:
