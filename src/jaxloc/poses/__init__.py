@@ -2,7 +2,7 @@
 
 from jaxloc.poses import compound, direction, manifold, planar, rotation, se2, se3, series, trajectory
 from jaxloc.poses.direction import Direction
-from jaxloc.poses.group import Group, Manifold
+from jaxloc.poses.group import Group
 from jaxloc.poses.manifold import carry, is_flat, local, retract, tangent_dimension, tangent_labels
 from jaxloc.poses.rotation import SO2, SO3, wrap_angle
 from jaxloc.poses.se2 import SE2
@@ -16,7 +16,6 @@ __all__ = [
     "SO3",
     "Direction",
     "Group",
-    "Manifold",
     "Trajectory",
     "carry",
     "chain",

@@ -2,19 +2,20 @@
 
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
 from jaxloc.poses import series
-from jaxloc.poses.group import Manifold, as_floats, matmul
+from jaxloc.poses.group import as_floats, matmul
 
 # Coefficients of asin(x) / x in x^2.
 _ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
 _SWITCH = 1e-2
 
 
-class Direction(Manifold):
+class Direction(eqx.Module):
     """A unit vector: where a translation of unknown length points, a bearing, the normal of a plane.
 
     It moves along great circles: ``retract(d) = cos|d| v + sin|d| / |d| B d`` with the orthonormal tangents B of

@@ -1,4 +1,4 @@
-"""What every pose and rotation can do: the interfaces of a manifold and of a matrix Lie group."""
+"""What every pose and rotation can do: the interface of a matrix Lie group."""
 
 from abc import abstractmethod
 from typing import Any
@@ -26,10 +26,11 @@ def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.stack([jnp.stack([o, -z, y]), jnp.stack([z, o, -x]), jnp.stack([-y, x, o])])
 
 
-class Manifold(eqx.Module):
-    """What moves along tangents of fewer entries than it has numbers.
+class Group(eqx.Module):
+    """A transformation ``T_a_b`` that maps coordinates of frame b to frame a.
 
-    Stacks are the same records with leading axes on their arrays; methods act on one and are batched by ``jax.vmap``.
+    Tangents are ordered (translation, rotation) and perturb on the right: ``T @ exp(d)``. Stacks of poses are the same
+    records with leading axes on their arrays; methods act on one pose and are batched by ``jax.vmap``.
     """
 
     dof: eqx.AbstractClassVar[int]
@@ -38,22 +39,7 @@ class Manifold(eqx.Module):
     @property
     @abstractmethod
     def batch_shape(self) -> tuple[int, ...]:
-        """Leading axes of a stack; empty for one."""
-
-    @abstractmethod
-    def retract(self, delta: Array) -> Any:
-        """The point that a tangent leads to."""
-
-    @abstractmethod
-    def local(self, other: Any) -> Array:
-        """The tangent that leads to another point."""
-
-
-class Group(Manifold):
-    """A transformation ``T_a_b`` that maps coordinates of frame b to frame a.
-
-    Tangents are ordered (translation, rotation) and perturb on the right: ``T @ exp(d)``.
-    """
+        """Leading axes of a stack; empty for one pose."""
 
     @abstractmethod
     def compose(self, other: Any) -> Any:
@@ -78,6 +64,10 @@ class Group(Manifold):
     @abstractmethod
     def apply(self, points: Array) -> Array:
         """Points "n k" of frame b in frame a."""
+
+    @abstractmethod
+    def retract(self, delta: Array) -> Any:
+        """The pose ``T @ exp(delta)``."""
 
     def local(self, other: Any) -> Array:
         """The tangent that retracts this pose to the other: ``log(T^-1 @ other)``."""

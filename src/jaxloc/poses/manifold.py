@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxloc.poses.group import Manifold
+from jaxloc.poses.direction import Direction
+from jaxloc.poses.group import Group
 
 
 def _is_manifold(node: Any) -> bool:
-    return isinstance(node, Manifold)
+    return isinstance(node, Group | Direction)
 
 
 def _moves(node: Any) -> bool:
