@@ -19,7 +19,6 @@ from jaxloc.refinement.calibration import (
     board_errors,
     calibrate,
     camera_parameters,
-    homography,
 )
 from jaxloc.refinement.calibration.camera import check_corners, prepare
 from jaxloc.refinement.calibration.start import safe_views
@@ -217,18 +216,6 @@ def test_single_precision_is_near(rng):
         values, sigmas = np.asarray(exact.values), np.asarray(exact.sigmas())
     difference = np.abs(numbers(fit.value.camera) - values)
     assert (difference <= 0.2 * sigmas).all()
-
-
-def test_homography(x64, rng):
-    plane = rng.uniform(-1, 1, (12, 2))
-    matrix = np.array([[300.0, 20.0, 320.0], [-10.0, 310.0, 240.0], [0.1, -0.05, 1.0]])
-    seen = np.column_stack([plane, np.ones(12)]) @ matrix.T
-    pixels = seen[:, :2] / seen[:, 2:] + rng.normal(0, 0.1, (12, 2))
-    pixels[3] = 1e4
-    valid = np.arange(12) != 3
-    found = homography(jnp.asarray(plane.T), jnp.asarray(pixels.T), jnp.asarray(valid))
-    theirs, _ = cv2.findHomography(plane[valid], pixels[valid])
-    np.testing.assert_allclose(found / found[2, 2], theirs, rtol=2e-3, atol=1e-3)
 
 
 def test_derivatives_picture_by_picture_are_those_of_the_whole(x64, rng):

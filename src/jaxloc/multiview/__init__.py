@@ -1,6 +1,8 @@
 """Closed-form geometry of several views."""
 
-from jaxloc.multiview import minimal, rectification, triangulation
+from jaxloc.multiview import homography, intersection, minimal, rectification, triangulation
+from jaxloc.multiview.homography import estimate_homography
+from jaxloc.multiview.intersection import intersect
 from jaxloc.multiview.minimal import MinimalPoses, p3p
 from jaxloc.multiview.triangulation import Linear, Sampled, TriangulationMethod, Unscented, coverage, stereo
 
@@ -11,6 +13,10 @@ __all__ = [
     "TriangulationMethod",
     "Unscented",
     "coverage",
+    "estimate_homography",
+    "homography",
+    "intersect",
+    "intersection",
     "minimal",
     "p3p",
     "rectification",

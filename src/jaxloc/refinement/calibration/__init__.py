@@ -3,7 +3,6 @@
 from jaxloc.refinement.calibration.camera import Calibrated, calibrate
 from jaxloc.refinement.calibration.model import Fisheye, Glass, Intrinsics, LensModel, NoLens, Parametrization
 from jaxloc.refinement.calibration.problem import CameraProblem, Rig, StereoProblem, Unknowns
-from jaxloc.refinement.calibration.start import homography
 from jaxloc.refinement.calibration.stereo import CalibratedStereo, Corners, calibrate_stereo
 from jaxloc.refinement.calibration.summary import Errors, Parameters, board_errors, camera_names, camera_parameters
 
@@ -28,5 +27,4 @@ __all__ = [
     "calibrate_stereo",
     "camera_names",
     "camera_parameters",
-    "homography",
 ]

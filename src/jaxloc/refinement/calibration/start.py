@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc.multiview.homography import direct_linear_transform
 from jaxloc.poses import SE3, SO3
 from jaxloc.poses.group import matmul
 
@@ -70,34 +71,6 @@ def extent(views: Views, shape: tuple[int, int] | None) -> tuple[Float[Array, "2
     return 0.5 * (low + high), jnp.maximum(0.5 * jnp.max(high - low), 1.0)
 
 
-def homography(
-    points: Float[Array, "2 m"], pixels: Float[Array, "2 m"], valid: Bool[Array, " m"]
-) -> Float[Array, "3 3"]:
-    """Homography from points of a plane to pixels: the normalized direct linear transform.
-
-    Args:
-        points: of the plane, m.
-        pixels: where they appear, px.
-        valid: which count.
-
-    Returns:
-        Matrix of unit Frobenius norm; finite, but without meaning where fewer than four corners count.
-
-    References:
-        Hartley and Zisserman, *Multiple View Geometry*, 2004, algorithm 4.2.
-    """
-    to_points, (x, y) = _normalizer(points, valid)
-    to_pixels, (u, v) = _normalizer(pixels, valid)
-    one, zero = valid.astype(u.dtype), jnp.zeros_like(u)
-    rows_u = jnp.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
-    rows_v = jnp.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)
-    _, _, right = jnp.linalg.svd(jnp.concatenate([rows_u, rows_v]), full_matrices=True)
-    matrix = matmul(jnp.linalg.inv(to_pixels), matmul(right[8].reshape(3, 3), to_points))
-    norm = jnp.linalg.norm(matrix)
-    good = jnp.isfinite(norm) & (norm > 0)
-    return jnp.where(good, matrix / jnp.where(good, norm, 1.0), jnp.eye(3, dtype=u.dtype))
-
-
 def closed_form(views: Views, center: Float[Array, "2"], scale: Float[Array, ""]) -> Guess:
     """The best of three closed forms, by what is left over.
 
@@ -109,7 +82,7 @@ def closed_form(views: Views, center: Float[Array, "2"], scale: Float[Array, ""]
         Zhang, "A flexible new technique for camera calibration", T-PAMI 2000, section 3.1 [T-17].
     """
     views, center, scale = jax.lax.stop_gradient((views, center, scale))
-    matrices = jax.vmap(homography, (None, 0, 0))(views.board[:2], views.pixels, views.valid)
+    matrices = jax.vmap(direct_linear_transform, (None, 0, 0))(views.board[:2], views.pixels, views.valid)
     used = views.used()
     normalize = _similarity(center, scale)
     conics = jnp.where(used[:, None, None], jax.vmap(lambda h: _unit(matmul(normalize, h)))(matrices), 0.0)
@@ -129,16 +102,6 @@ def closed_form(views: Views, center: Float[Array, "2"], scale: Float[Array, ""]
         lambda leaf, idle: jnp.where(used.reshape(-1, *([1] * idle.ndim)), leaf, idle[None]), boards, rest
     )
     return Guess(focals[best], centers[best], boards)
-
-
-def _normalizer(points: Float[Array, "2 m"], valid: Array) -> tuple[Float[Array, "3 3"], Float[Array, "2 m"]]:
-    """Similarity that brings points around the origin at distances near one, and the points there; zero if masked."""
-    count = jnp.maximum(jnp.sum(valid), 1).astype(points.dtype)
-    mean = jnp.sum(jnp.where(valid[None, :], points, 0.0), axis=1) / count
-    centered = jnp.where(valid[None, :], points - mean[:, None], 0.0)
-    spread = jnp.sqrt(jnp.sum(centered**2) / count)
-    spread = jnp.where(spread > 0, spread, 1.0)
-    return _similarity(mean, spread), centered / spread
 
 
 def _similarity(center: Float[Array, "2"], scale: Float[Array, ""]) -> Float[Array, "3 3"]:

@@ -1,0 +1,288 @@
+"""Homographies of points: in closed form, and robustly, with covariance.
+
+A closed form carries no derivatives; what is refined has those of its minimum.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from jaxloc.images import Homography
+from jaxloc.poses import SE3, Direction
+from jaxloc.poses.group import matmul
+from jaxloc.sensors import Pinhole
+from jaxloc.solvers import Estimate, LevenbergMarquardt, Loss, Problem, Quadratic, Tukey, ransac, solve
+
+# 99 % of the squared distance of two whitened components, as a distance.
+_GATE = 3.035
+# Of Tukey's kernel on two components: 95 % efficient.
+_TUKEY = 5.12
+_SAMPLE = 4
+
+
+@eqx.filter_jit
+def of_plane(
+    first: Pinhole, second: Pinhole, T_first_second: SE3, normal: Direction, distance: Float[Array, ""]
+) -> Homography:
+    """Homography from pixels of the first camera to those of the second, of a plane ``n . x = d``.
+
+    ``H = K2 R^T (I - t n^T / d) K1^-1`` with ``T_first_second = (R, t)``; lenses are left out.
+
+    Args:
+        first: the first camera.
+        second: the second camera.
+        T_first_second: pose of the second camera in the frame of the first.
+        normal: of the plane, frame of the first camera, away from it.
+        distance: of the plane from the first camera, m.
+
+    Returns:
+        The homography.
+
+    References:
+        Hartley and Zisserman, *Multiple View Geometry*, 2004, result 13.1 [K-17].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> camera = jl.sensors.Pinhole(100.0, 100.0, 50.0, 50.0)
+        >>> step = jl.poses.SE3.from_euler(jnp.array([0.1, 0.0, 0.0]), 0.0, 0.0, 0.0)
+        >>> wall = jl.poses.Direction(jnp.array([0.0, 0.0, 1.0]))
+        >>> found = jl.multiview.homography.of_plane(camera, camera, step, wall, jnp.array(2.0))
+        >>> [round(float(x), 2) for x in found.apply(jnp.array([[50.0, 50.0]]))[0]]
+        [45.0, 50.0]
+    """
+    shift = T_first_second.translation[:, None] * normal.vector[None, :] / distance
+    moved = matmul(T_first_second.rotation.matrix().T, jnp.eye(3, dtype=shift.dtype) - shift)
+    return Homography.from_matrix(matmul(second.matrix(), matmul(moved, _inverse(first))))
+
+
+def direct_linear_transform(
+    points: Float[Array, "2 m"], pixels: Float[Array, "2 m"], valid: Bool[Array, " m"]
+) -> Float[Array, "3 3"]:
+    """Homography from points of a plane to pixels: the normalized direct linear transform, without derivatives.
+
+    Args:
+        points: of the plane, any unit; finite.
+        pixels: where they appear, px; finite.
+        valid: which count.
+
+    Returns:
+        Matrix of unit Frobenius norm; finite, but without meaning where fewer than four points count.
+
+    References:
+        Hartley and Zisserman, *Multiple View Geometry*, 2004, algorithm 4.2.
+    """
+    points, pixels = jax.lax.stop_gradient((points, pixels))
+    to_points, (x, y) = normalizer(points, valid)
+    to_pixels, (u, v) = normalizer(pixels, valid)
+    one, zero = valid.astype(u.dtype), jnp.zeros_like(u)
+    rows_u = jnp.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
+    rows_v = jnp.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)
+    _, _, right = jnp.linalg.svd(jnp.concatenate([rows_u, rows_v]), full_matrices=True)
+    matrix = matmul(_denormalizer(to_pixels), matmul(right[8].reshape(3, 3), to_points))
+    norm = jnp.sqrt(jnp.sum(matrix * matrix))
+    good = jnp.isfinite(norm) & (norm > 0)
+    return jnp.where(good, matrix / jnp.where(good, norm, 1.0), jnp.eye(3, dtype=u.dtype))
+
+
+def normalizer(
+    points: Float[Array, "2 m"], valid: Bool[Array, " m"]
+) -> tuple[Float[Array, "3 3"], Float[Array, "2 m"]]:
+    """Similarity that brings points around the origin at distances near one, and the points there; zero if masked.
+
+    References:
+        Hartley, "In defense of the eight-point algorithm", T-PAMI 1997 [R-49].
+    """
+    count = jnp.maximum(jnp.sum(valid), 1).astype(points.dtype)
+    mean = jnp.sum(jnp.where(valid[None, :], points, 0.0), axis=1) / count
+    centered = jnp.where(valid[None, :], points - mean[:, None], 0.0)
+    squared = jnp.sum(centered**2) / count
+    spread = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+    zero, one = jnp.zeros_like(spread), jnp.ones_like(spread)
+    rows = [[1.0 / spread, zero, -mean[0] / spread], [zero, 1.0 / spread, -mean[1] / spread], [zero, zero, one]]
+    return jnp.stack([jnp.stack(row) for row in rows]), centered / spread
+
+
+def _denormalizer(similarity: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    scale = similarity[0, 0]
+    zero, one = jnp.zeros_like(scale), jnp.ones_like(scale)
+    rows = [[1.0 / scale, zero, -similarity[0, 2] / scale], [zero, 1.0 / scale, -similarity[1, 2] / scale]]
+    return jnp.stack([jnp.stack(row) for row in [*rows, [zero, zero, one]]])
+
+
+def _inverse(camera: Pinhole) -> Float[Array, "3 3"]:
+    """Inverse of a camera matrix."""
+    one, zero = jnp.ones_like(camera.fx), jnp.zeros_like(camera.fx)
+    x, y = 1.0 / camera.fx, 1.0 / camera.fy
+    tilt = -camera.skew * x * y
+    rows = [[x, tilt, -camera.cx * x - tilt * camera.cy], [zero, y, -camera.cy * y], [zero, zero, one]]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+@eqx.filter_jit
+def four_points(first: Float[Array, "4 2"], second: Float[Array, "4 2"]) -> Homography:
+    """The homography that takes four points to four others: exact, smooth, without linear solver.
+
+    Four points are a frame of the projective plane; the homography is the change from one frame to the other.
+
+    Args:
+        first: four points, no three on a line.
+        second: where they go.
+
+    Returns:
+        The homography; finite, without meaning, where three points lie on a line.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> square = jnp.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        >>> jl.multiview.homography.four_points(square, 2.0 * square).apply(jnp.array([[0.5, 0.25]])).round(4).tolist()
+        [[1.0, 0.5]]
+    """
+    to_first, to_second = _frame(first), _frame(second)
+    matrix = matmul(to_second, _adjugate(to_first))
+    largest = jnp.max(jnp.abs(matrix))
+    good = jnp.isfinite(largest) & (largest > 0)
+    matrix = jnp.where(good, matrix, jnp.eye(3, dtype=matrix.dtype))
+    return Homography.from_matrix(matrix / jnp.where(good, largest, 1.0))
+
+
+def _frame(points: Float[Array, "4 2"]) -> Float[Array, "3 3"]:
+    """Matrix that takes the axes and their sum to four points, up to scale."""
+    p = jnp.concatenate([points, jnp.ones_like(points[:, :1])], axis=1)
+    weights = jnp.sum(_adjugate(p[:3].T) * p[3][None, :], axis=1)
+    return p[:3].T * weights[None, :]
+
+
+def _adjugate(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    a, b, c = m[:, 0], m[:, 1], m[:, 2]
+    return jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
+
+
+class TransferError(Problem):
+    """Corresponding points of a plane in two pictures, both with noise; the state is the `Homography`.
+
+    The error ``e = x2 - H(x1)`` has, to first order, the covariance ``s^2 (I + J J^T)`` with the derivative J of the
+    map at ``x1``; it is whitened by that: Sampson's error.
+
+    Attributes:
+        first: "2 n", px; finite everywhere.
+        second: "2 n", px; finite everywhere.
+        sigma: standard deviation of a coordinate in either picture, px.
+        valid: which count.
+        loss: robust kernel over the two components.
+
+    References:
+        Hartley and Zisserman, *Multiple View Geometry*, 2004, section 4.2.6.
+    """
+
+    first: Float[Array, "2 n"]
+    second: Float[Array, "2 n"]
+    sigma: Float[Array, ""]
+    valid: Bool[Array, " n"]
+    loss: Any = Quadratic()
+
+    def residual(self, state: Homography) -> Float[Array, "2 n"]:
+        """Whitened errors; a point that maps behind the horizon counts as a gross error."""
+        return _whitened(state.homogeneous, self.first, self.second, self.sigma, self.valid)
+
+
+def _whitened(matrix: Array, first: Array, second: Array, sigma: Array, valid: Array) -> Float[Array, "2 n"]:
+    x, y, w = matmul(matrix[:, :2], first) + matrix[:, 2:]
+    # The sign of the determinant is one: points of the plane that both cameras see have positive w.
+    ahead = valid & (w > float(jnp.finfo(w.dtype).eps))
+    inverse = 1.0 / jnp.where(ahead, w, 1.0)
+    u, v = jnp.where(ahead, x, 0.0) * inverse, jnp.where(ahead, y, 0.0) * inverse
+    by_x = [(matrix[0, i] - u * matrix[2, i]) * inverse for i in range(2)]
+    by_y = [(matrix[1, i] - v * matrix[2, i]) * inverse for i in range(2)]
+    s00 = 1.0 + by_x[0] ** 2 + by_x[1] ** 2
+    s01 = by_x[0] * by_y[0] + by_x[1] * by_y[1]
+    s11 = 1.0 + by_y[0] ** 2 + by_y[1] ** 2
+    e0, e1 = second[0] - u, second[1] - v
+    root = jnp.sqrt(s00)
+    lower = s01 / s00
+    rest = jnp.sqrt(jnp.maximum(s11 - s01 * lower, 1.0 / s00))
+    whitened = jnp.stack([e0 / root, (e1 - lower * e0) / rest]) / sigma
+    return jnp.where(ahead[None, :], whitened, jnp.where(valid, 1e3, 0.0).astype(whitened.dtype)[None, :])
+
+
+def _fit_sample(sample: tuple[Array, Array, Array]) -> Homography:
+    return four_points(sample[0], sample[1])
+
+
+def _distance(model: Homography, data: tuple[Array, Array, Array]) -> Float[Array, " n"]:
+    first, second, sigma = data
+    everyone = jnp.ones(first.shape[:1], bool)
+    return jnp.sqrt(jnp.sum(_whitened(model.homogeneous, first.T, second.T, sigma[0], everyone) ** 2, axis=0))
+
+
+@eqx.filter_jit
+def estimate_homography(
+    first: Float[Array, "n 2"],
+    second: Float[Array, "n 2"],
+    *,
+    key: Key[Array, ""],
+    sigma: Any = 1.0,
+    valid: Bool[Array, " n"] | None = None,
+    hypotheses: int = 128,
+    loss: Loss | None = None,
+) -> Estimate:
+    """Homography between two pictures of a plane (or of a turning camera), among false correspondences.
+
+    Samples of four points vote (MSAC on the whitened transfer error); the winner is refitted to its inliers and then
+    refined on SL(3) under a robust kernel over all correspondences.
+
+    Args:
+        first: points of the first picture, px.
+        second: their partners in the second, px.
+        key: random key.
+        sigma: standard deviation of a coordinate in either picture, px.
+        valid: which count; numbers that are not finite never do.
+        hypotheses: number of samples; static.
+        loss: kernel of the refinement, in sigmas; Tukey's of 95 % efficiency if None.
+
+    Returns:
+        Estimate of `Homography`. ``ok`` is False when no homography explains more than four points, or points lie on a
+        line.
+
+    Raises:
+        ValueError: fewer than four correspondences.
+
+    References:
+        Fischler and Bolles 1981 [K-60]; Torr and Zisserman, "MLESAC", CVIU 2000; Hartley and Zisserman 2004, 4.8.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxloc as jl
+        >>> points = jax.random.uniform(jax.random.key(0), (30, 2), maxval=100.0)
+        >>> moved = points.at[:8].add(30.0) + jnp.array([[5.0, 2.0]])
+        >>> found = jl.multiview.homography.estimate_homography(points, moved, key=jax.random.key(1))
+        >>> bool(found.ok), [round(float(x), 1) for x in found.value.apply(jnp.array([[50.0, 50.0]]))[0]]
+        (True, [55.0, 52.0])
+    """
+    finite = jnp.all(jnp.isfinite(first), axis=1) & jnp.all(jnp.isfinite(second), axis=1)
+    valid = finite if valid is None else valid & finite
+    first, second = jnp.where(valid[:, None], first, 0.0), jnp.where(valid[:, None], second, 0.0)
+    sigma = jnp.asarray(sigma, first.dtype)
+    data = jax.lax.stop_gradient((first, second, jnp.broadcast_to(sigma, first.shape[:1])))
+    options = {"sample_size": _SAMPLE, "threshold": _GATE, "hypotheses": hypotheses}
+    found = ransac(data, _fit_sample, _distance, **options, key=key, valid=valid)
+    start = _refitted(found.model, data, found.inliers, valid)
+    loss = Tukey(jnp.asarray(_TUKEY, first.dtype)) if loss is None else loss
+    fit = solve(TransferError(first.T, second.T, sigma, valid, loss), start, solver=LevenbergMarquardt())
+    inliers = valid & (_distance(jax.lax.stop_gradient(fit.value), data) < _GATE)
+    return _believed_if(fit, found.ok & (jnp.sum(inliers) > _SAMPLE))
+
+
+def _refitted(model: Homography, data: Any, inliers: Array, valid: Array) -> Homography:
+    """The sample's model fitted to its inliers, where that draws more of them in."""
+    first, second, _ = data
+    again = Homography.from_matrix(direct_linear_transform(first.T, second.T, inliers))
+    better = jnp.sum(valid & (_distance(again, data) < _GATE)) >= jnp.sum(inliers)
+    return Homography(jnp.where(better, again.homogeneous, model.homogeneous))
+
+
+def _believed_if(fit: Estimate, condition: Bool[Array, ""]) -> Estimate:
+    ok = fit.ok & condition
+    value = jax.tree.map(lambda leaf: jnp.where(ok, leaf, jax.lax.stop_gradient(leaf)), fit.value)
+    return eqx.tree_at(lambda e: (e.value, e.ok), fit, (value, ok))
