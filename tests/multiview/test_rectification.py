@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxloc.images.interpolation import sample
-from jaxloc.multiview.rectification import lookup, rectify
+from jaxloc.multiview.rectification import lookup, rectify, rectifying_homographies
 from jaxloc.poses import SE3, SO3
 from jaxloc.sensors import BrownConrady, Pinhole
 
@@ -106,3 +106,39 @@ def test_gradient(x64):
     step = 1e-6
     numeric = [(row(step * e) - row(-step * e)) / (2 * step) for e in jnp.eye(6)]
     np.testing.assert_allclose(jax.grad(row)(jnp.zeros(6)), numeric, rtol=1e-5, atol=1e-6)
+
+
+def uncalibrated(rng, turn=(0.05, -0.1, 0.15), step=(0.9, 0.1, 0.2)):
+    """Points in two pictures of a camera that turned and moved, and the fundamental matrix ``x1^T F x2 = 0``."""
+    K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+    T = SE3(SO3.exp(jnp.asarray(turn)), jnp.asarray(step))
+    points = np.column_stack([rng.uniform(-1, 2, (40, 1)), rng.uniform(-1, 1, (40, 1)), rng.uniform(4, 9, (40, 1))])
+    x, y, z = step
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ np.asarray(T.rotation.matrix())
+    inverse = np.linalg.inv(K)
+    seen = [p @ K.T for p in (points, np.asarray(T.inverse().apply(jnp.asarray(points))))]
+    return inverse.T @ essential @ inverse, *(jnp.asarray(p[:, :2] / p[:, 2:]) for p in seen)
+
+
+def test_rectifying_homographies_make_rows_equal(x64, rng):
+    F, first, second = uncalibrated(rng)
+    pair = rectifying_homographies(jnp.asarray(F), first, second, shape=(480, 640))
+    left, right = pair.first.apply(first), pair.second.apply(second)
+    assert bool(pair.ok)
+    np.testing.assert_allclose(left[:, 1], right[:, 1], atol=1e-8)
+    # OpenCV's rows are equal too, and its columns no nearer.
+    _, one, two = cv2.stereoRectifyUncalibrated(np.array(first), np.array(second), F.T, (640, 480))
+    theirs = [cv2.perspectiveTransform(np.array(p)[None], h)[0] for p, h in ((first, one), (second, two))]
+    np.testing.assert_allclose(theirs[0][:, 1], theirs[1][:, 1], atol=1e-3)
+    assert np.square(left - right).sum() <= 1.01 * np.square(theirs[0] - theirs[1]).sum()
+    corners = jnp.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [0.0, 479.0]])
+    assert np.abs(pair.second.apply(corners) - corners).max() < 250.0
+
+
+def test_an_epipole_in_the_picture_is_told(x64, rng):
+    F, first, second = uncalibrated(rng, step=(0.0, 0.0, 1.0))
+    blank = jnp.full_like(first, jnp.nan)
+    for matrix, points in ((F, first), (np.zeros((3, 3)), first), (np.full((3, 3), np.nan), first), (F, blank)):
+        pair = rectifying_homographies(jnp.asarray(matrix), points, second, shape=(480, 640))
+        assert not bool(pair.ok)
+        np.testing.assert_array_equal(pair.first.matrix(), np.eye(3))

@@ -1,12 +1,14 @@
-"""Two calibrated cameras turned, in their pictures, until rows show the same points."""
+"""Two cameras turned, in their pictures, until rows show the same points; also two that nobody calibrated."""
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc.images import Homography
 from jaxloc.poses import SE3, SO3
 from jaxloc.poses.group import matmul, skew
 from jaxloc.sensors import Pinhole, StereoRig
+from jaxloc.solvers.linear import factor
 
 
 class Rectification(eqx.Module):
@@ -102,6 +104,119 @@ def lookup(camera: Pinhole, rotation: SO3, target: Pinhole, *, shape: tuple[int,
     u, v = camera.project_components(px, py, pz)
     found = jnp.where(seen[None, :], jnp.stack([u, v]), -1.0)
     return jnp.moveaxis(found.reshape(2, *shape), 0, -1)
+
+
+class RectifyingPair(eqx.Module):
+    """Maps of two pictures to a pair with equal rows.
+
+    Attributes:
+        first: from pixels of the first picture to its rectified ones.
+        second: of the second picture.
+        ok: whether there are such maps: not when an epipole lies within the picture.
+    """
+
+    first: Homography
+    second: Homography
+    ok: Bool[Array, ""]
+
+
+@eqx.filter_jit
+def rectifying_homographies(
+    fundamental: Float[Array, "3 3"],
+    first: Float[Array, "n 2"],
+    second: Float[Array, "n 2"],
+    *,
+    shape: tuple[int, int],
+    valid: Bool[Array, " n"] | None = None,
+) -> RectifyingPair:
+    """Rectifies two pictures of which only the fundamental matrix is known.
+
+    The map of the second picture sends its epipole to infinity along x and distorts its middle least; that of the
+    first makes rows equal and, by what is still free, corresponding columns as near as can be.
+
+    Args:
+        fundamental: F with ``x1^T F x2 = 0``, px.
+        first: points of the first picture, px.
+        second: their partners.
+        shape: (rows, columns) of the pictures.
+        valid: which pairs count.
+
+    Returns:
+        The two maps; the identity where ``ok`` is False.
+
+    References:
+        Hartley, "Theory and practice of projective rectification", IJCV 1999; thesis figure 2.4 [T-21].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> sideways = jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+        >>> points = jnp.array([[10.0, 20.0], [50.0, 30.0], [30.0, 70.0], [80.0, 80.0]])
+        >>> partners = points - jnp.array([[5.0, 0.0]])
+        >>> pair = jl.multiview.rectification.rectifying_homographies(sideways, points, partners, shape=(100, 100))
+        >>> bool(pair.ok), bool(jnp.allclose(pair.second.matrix(), jnp.eye(3), atol=1e-4))
+        (True, True)
+    """
+    finite = jnp.all(jnp.isfinite(first), axis=1) & jnp.all(jnp.isfinite(second), axis=1)
+    weight = (finite if valid is None else finite & valid).astype(first.dtype)
+    first, second = (jnp.where(weight[:, None] > 0, points, 0.0) for points in (first, second))
+    matrix = jnp.where(jnp.isfinite(fundamental), fundamental, 0.0)
+    epipole, known = _null_vector(matrix)
+    of_second, outside = _to_infinity(epipole, shape)
+    # Any map that carries epipolar lines: F^T = [e] M.
+    transfer = matmul(skew(epipole), _unit(matrix.T)) + epipole[:, None] * jnp.ones((1, 3), epipole.dtype)
+    moved = matmul(of_second, transfer)
+    x, target = _transferred(moved, first), _transferred(of_second, second)[0]
+    normal = matmul(x * weight[None, :], x.T)
+    row = factor(normal).solve(matmul(x * weight[None, :], target))
+    of_first = jnp.concatenate([matmul(row[None, :], moved), moved[1:]])
+    regular = jnp.abs(jnp.linalg.det(_unit(of_first))) > float(jnp.finfo(row.dtype).eps)
+    ok = known & outside & regular & (jnp.sum(weight) >= 3) & jnp.all(jnp.isfinite(of_first))
+    eye = jnp.eye(3, dtype=row.dtype)
+    return RectifyingPair(*(Homography.from_matrix(jnp.where(ok, h, eye)) for h in (of_first, of_second)), ok)
+
+
+def _unit(matrix: Array) -> Array:
+    squared = jnp.sum(matrix * matrix)
+    return matrix / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+
+
+def _null_vector(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
+    """Unit vector at right angles to the rows of a matrix of rank two."""
+    a, b, c = _unit(matrix)
+    products = jnp.stack([jnp.cross(a, b), jnp.cross(b, c), jnp.cross(c, a)])
+    squares = jnp.sum(products * products, axis=1)
+    best = jnp.argmax(squares)
+    known = squares[best] > float(jnp.finfo(matrix.dtype).eps) ** 2
+    return jnp.where(known, products[best], 1.0) / jnp.sqrt(jnp.where(known, squares[best], 3.0)), known
+
+
+def _to_infinity(epipole: Float[Array, "3"], shape: tuple[int, int]) -> tuple[Float[Array, "3 3"], Bool[Array, ""]]:
+    """The map of a picture that sends a point to infinity along x, near the identity at the picture's middle."""
+    middle = jnp.asarray([0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1)], epipole.dtype)
+    zero, one = jnp.zeros_like(epipole[0]), jnp.ones_like(epipole[0])
+
+    def matrix(*rows: tuple) -> Array:
+        return jnp.stack([jnp.stack(row) for row in rows])
+
+    x, y = epipole[0] - middle[0] * epipole[2], epipole[1] - middle[1] * epipole[2]
+    # Turned by less than a quarter: of the two signs of the homogeneous point, the one to the right.
+    sign = jnp.where(x < 0, -1.0, 1.0).astype(x.dtype)
+    squared = x * x + y * y
+    length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+    cos, sin = sign * x / length, -sign * y / length
+    bend = -sign * epipole[2] / length
+    outside = (squared > 0) & (jnp.abs(bend) * 0.5 * max(shape) < 1.0)
+    center = matrix((one, zero, -middle[0]), (zero, one, -middle[1]), (zero, zero, one))
+    turn = matrix((cos, -sin, zero), (sin, cos, zero), (zero, zero, one))
+    push = matrix((one, zero, zero), (zero, one, zero), (bend, zero, one))
+    back = matrix((one, zero, middle[0]), (zero, one, middle[1]), (zero, zero, one))
+    return matmul(back, matmul(push, matmul(turn, center))), outside
+
+
+def _transferred(matrix: Float[Array, "3 3"], points: Float[Array, "n 2"]) -> Float[Array, "3 n"]:
+    x, y, w = matmul(matrix[:, :2], points.T) + matrix[:, 2:]
+    safe = jnp.where(w == 0, 1.0, w)
+    return jnp.stack([x / safe, y / safe, jnp.ones_like(w)])
 
 
 def _onto_x(axis: Float[Array, "3"]) -> Float[Array, "3 3"]:
