@@ -1,6 +1,6 @@
 """Closed-form geometry of several views."""
 
-from jaxloc.multiview import homography, intersection, minimal, rectification, triangulation
+from jaxloc.multiview import disparity, homography, intersection, minimal, rectification, triangulation
 from jaxloc.multiview.homography import estimate_homography
 from jaxloc.multiview.intersection import intersect
 from jaxloc.multiview.minimal import MinimalPoses, p3p
@@ -13,6 +13,7 @@ __all__ = [
     "TriangulationMethod",
     "Unscented",
     "coverage",
+    "disparity",
     "estimate_homography",
     "homography",
     "intersect",

@@ -1,0 +1,372 @@
+"""Dense stereo: a disparity for every pixel of a rectified pair, by windows in JAX or by OpenCV, and to subpixels."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Num
+
+from jaxloc.images import opencv, subpixel
+
+# Cost where a window leaves the other picture.
+_OUTSIDE = 1e9
+
+
+class DisparityMap(eqx.Module):
+    """Columns by which points of the left picture lie further left in the right one.
+
+    Attributes:
+        disparity: px; zero where not valid.
+        variance: px^2; one where not valid. It knows the noise of the pixels, not wrong matches; that of matched blocks
+            is right within a factor of three, that of `refine` is the better one.
+        valid: pixels with a disparity.
+    """
+
+    disparity: Float[Array, "h w"]
+    variance: Float[Array, "h w"]
+    valid: Bool[Array, "h w"]
+
+
+class WindowCost(eqx.Module):
+    """How unlike two windows are."""
+
+    @abstractmethod
+    def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
+        """What is needed of a picture, once: arrays "... h w"."""
+
+    @abstractmethod
+    def compare(self, left: Any, right: Any, size: int) -> Float[Array, "h w"]:
+        """Cost of the windows around each pixel of two prepared pictures."""
+
+
+class SSD(WindowCost):
+    """Mean squared difference of grey levels [R-44]."""
+
+    def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
+        """The picture."""
+        del size
+        return image
+
+    def compare(self, left: Any, right: Any, size: int) -> Float[Array, "h w"]:
+        """Mean over the window."""
+        return box_mean((left - right) ** 2, size)
+
+
+class ZNCC(WindowCost):
+    """One minus the normalized correlation: blind to gain and bias of a window [R-44].
+
+    Attributes:
+        least_contrast: standard deviation below which a window has no texture, grey levels.
+    """
+
+    least_contrast: float = eqx.field(static=True, default=1.0)
+
+    def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
+        """The picture about its mean, with the mean and the inverse deviation of each window."""
+        centered = image - jnp.mean(image)
+        mean = box_mean(centered, size)
+        spread = box_mean(centered**2, size) - mean**2
+        textured = spread > self.least_contrast**2
+        return jnp.stack([centered, mean, jnp.where(textured, lax.rsqrt(jnp.where(textured, spread, 1.0)), 0.0)])
+
+    def compare(self, left: Any, right: Any, size: int) -> Float[Array, "h w"]:
+        """Between 0 and 2."""
+        product = box_mean(left[0] * right[0], size) - left[1] * right[1]
+        return 1.0 - product * left[2] * right[2]
+
+
+class Census(WindowCost):
+    """Mean number of pixels whose order against the middle one differs, over the window; without derivatives.
+
+    Attributes:
+        radius: half sides (rows, columns) of the neighborhood whose order counts.
+
+    References:
+        Zabih and Woodfill, "Non-parametric local transforms for computing visual correspondence", ECCV 1994.
+    """
+
+    radius: tuple[int, int] = eqx.field(static=True, default=(3, 4))
+
+    def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
+        """Bits of the neighbors that are darker than the middle, 31 a word."""
+        del size
+        rows, columns = self.radius
+        height, width = image.shape
+        padded = jnp.pad(image, ((rows, rows), (columns, columns)), mode="edge")
+        bits = [
+            padded[i : i + height, j : j + width] < image
+            for i in range(2 * rows + 1)
+            for j in range(2 * columns + 1)
+            if (i, j) != self.radius
+        ]
+        words = [bits[start : start + 31] for start in range(0, len(bits), 31)]
+        return jnp.stack([sum(bit.astype(jnp.int32) << k for k, bit in enumerate(word)) for word in words])
+
+    def compare(self, left: Any, right: Any, size: int) -> Float[Array, "h w"]:
+        """Bits that differ, as a share of all."""
+        rows, columns = self.radius
+        count = (2 * rows + 1) * (2 * columns + 1) - 1
+        differ = jnp.sum(lax.population_count(jnp.bitwise_xor(left, right)), axis=0)
+        return box_mean(differ.astype(jnp.float32) / count, size)
+
+
+def box_mean(image: Float[Array, "h w"], size: int) -> Float[Array, "h w"]:
+    """Mean of the size x size window about each pixel; the edge is repeated outside.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> round(float(box_mean(jnp.eye(3), 3)[1, 1]), 3)
+        0.333
+    """
+    half, (height, width) = size // 2, image.shape
+    padded = jnp.pad(image, half, mode="edge")
+    rows = sum(padded[i : i + height] for i in range(size))
+    return sum(rows[:, j : j + width] for j in range(size)) / size**2
+
+
+class Matcher(eqx.Module):
+    """How a rectified pair is matched."""
+
+    @abstractmethod
+    def match(self, left: Num[Any, "h w"], right: Num[Any, "h w"]) -> DisparityMap:
+        """The disparity of each pixel of the left picture."""
+
+
+class BlockMatching(Matcher):
+    """The best window of a row, in JAX: for batches, accelerators and derivatives.
+
+    Attributes:
+        cost: how windows are compared.
+        size: odd side of a window, px.
+        num_disparities: disparities that are tried, from zero.
+        uniqueness: part by which every other disparity has to be dearer, its two neighbors excepted.
+        consistency: greatest difference of the disparities found from the left and from the right, px.
+    """
+
+    cost: WindowCost = Census()
+    size: int = eqx.field(static=True, default=9)
+    num_disparities: int = eqx.field(static=True, default=96)
+    uniqueness: float = eqx.field(static=True, default=0.05)
+    consistency: float = eqx.field(static=True, default=1.0)
+
+    def match(self, left: Num[Any, "h w"], right: Num[Any, "h w"]) -> DisparityMap:
+        """Lowest cost, a parabola through its neighbors, and the check from the other side."""
+        dtype = left.dtype if jnp.issubdtype(left.dtype, jnp.floating) else jnp.float32
+        return _match_blocks(jnp.asarray(left, dtype), jnp.asarray(right, dtype), self)
+
+
+class SemiGlobal(Matcher):
+    """OpenCV's semi-global matcher, on the host: the fast path. In sixteenths of a pixel; `refine` removes the steps.
+
+    Attributes:
+        num_disparities: disparities that are tried, a multiple of 16.
+        size: odd side of a window, px.
+        uniqueness: margin of the best cost over the second, percent.
+        consistency: greatest difference between left and right, px; -1 for none.
+        sigma: standard deviation of its disparities, px.
+
+    References:
+        Hirschmuller, "Stereo processing by semiglobal matching and mutual information", T-PAMI 2008.
+    """
+
+    num_disparities: int = eqx.field(static=True, default=96)
+    size: int = eqx.field(static=True, default=5)
+    uniqueness: int = eqx.field(static=True, default=10)
+    consistency: int = eqx.field(static=True, default=1)
+    sigma: float = eqx.field(static=True, default=0.25)
+
+    def match(self, left: Num[Any, "h w"], right: Num[Any, "h w"]) -> DisparityMap:
+        """Runs OpenCV on 8-bit grey levels.
+
+        Raises:
+            ImportError: OpenCV is not installed.
+        """
+        penalty = self.size**2
+        matcher = opencv.load().StereoSGBM_create(
+            minDisparity=0,
+            numDisparities=self.num_disparities,
+            blockSize=self.size,
+            P1=8 * penalty,
+            P2=32 * penalty,
+            disp12MaxDiff=self.consistency,
+            uniquenessRatio=self.uniqueness,
+            speckleWindowSize=100,
+            speckleRange=2,
+        )
+        found = matcher.compute(opencv.grey_bytes(left), opencv.grey_bytes(right)).astype(np.float32) / 16.0
+        valid = found > 0
+        variance = np.where(valid, self.sigma**2, 1.0).astype(np.float32)
+        return DisparityMap(jnp.asarray(np.where(valid, found, 0.0)), jnp.asarray(variance), jnp.asarray(valid))
+
+
+def match(
+    left: Num[Any, "h w"],
+    right: Num[Any, "h_right w_right"],
+    *,
+    matcher: Matcher = SemiGlobal(),  # noqa: B008 (an immutable record)
+) -> DisparityMap:
+    """The disparity of each pixel of the left picture of a rectified pair.
+
+    Args:
+        left: left picture, grey levels.
+        right: right picture.
+        matcher: `SemiGlobal()` is OpenCV's, on the host; `BlockMatching()` is traced: `jit`, `vmap` and `grad` it.
+
+    Returns:
+        Disparities, their variance, and where they are valid.
+
+    Raises:
+        ValueError: the pictures have not the same shape.
+
+    References:
+        Review section 5.1 [R-44]; thesis section 2.1 [T-7].
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxloc as jl
+        >>> scene = jax.random.uniform(jax.random.key(0), (24, 60), maxval=255.0)
+        >>> left, right = scene[:, :50], scene[:, 6:56]
+        >>> blocks = jl.multiview.disparity.BlockMatching(jl.multiview.disparity.ZNCC(), num_disparities=12)
+        >>> found = jl.multiview.disparity.match(left, right, matcher=blocks)
+        >>> bool(found.valid[12, 30]), round(float(found.disparity[12, 30]), 1)
+        (True, 6.0)
+    """
+    if left.shape != right.shape:
+        raise ValueError(f"Pictures of a pair have one shape; these have {left.shape} and {right.shape}.")
+    return matcher.match(left, right)
+
+
+@eqx.filter_jit
+def _match_blocks(left: Array, right: Array, options: BlockMatching) -> DisparityMap:
+    finite = jnp.isfinite(left) & jnp.isfinite(right)
+    left, right = (jnp.where(jnp.isfinite(image), image, 0.0) for image in (left, right))
+    costs = _cost_volume(left, right, options)
+    best = lax.stop_gradient(jnp.argmin(costs, axis=0))
+    last = options.num_disparities - 1
+    lowest, before, after = (
+        jnp.take_along_axis(costs, jnp.clip(best + step, 0, last)[None], axis=0)[0] for step in (0, -1, 1)
+    )
+    inner = (best > 0) & (best < last) & (before < _OUTSIDE) & (after < _OUTSIDE)
+    bend = jnp.where(inner, before - 2.0 * lowest + after, 0.0)
+    bent = bend > 1e-6
+    safe = jnp.where(bent, bend, 1.0)
+    disparity = best.astype(left.dtype) + jnp.where(bent, 0.5 * (before - after) / safe, 0.0)
+    valid = inner & bent & _inside(left.shape, options.size)
+    valid &= _is_unique(costs, best, lowest, options.uniqueness) & _agrees(costs, best, options.consistency)
+    valid &= box_mean(finite.astype(left.dtype), options.size) > 0.999
+    # What is left of the cost is noise, its curvature the texture: 2 c / (n c''), as for sums of squares.
+    variance = 2.0 * jnp.maximum(lowest, 0.0) / (options.size**2 * safe)
+    return DisparityMap(jnp.where(valid, disparity, 0.0), jnp.where(valid, variance, 1.0), valid)
+
+
+def _cost_volume(left: Array, right: Array, options: BlockMatching) -> Float[Array, "d h w"]:
+    prepared = [options.cost.prepare(image, options.size) for image in (left, right)]
+    width, span = left.shape[1], options.num_disparities
+    column = jnp.arange(width)
+    wide = jnp.pad(prepared[1], [(0, 0)] * (prepared[1].ndim - 1) + [(span, 0)])
+
+    def at(disparity: Array) -> Array:
+        moved = lax.dynamic_slice_in_dim(wide, span - disparity, width, axis=wide.ndim - 1)
+        cost = options.cost.compare(prepared[0], moved, options.size).astype(left.dtype)
+        return jnp.where((column >= disparity + options.size // 2)[None, :], cost, _OUTSIDE)
+
+    return lax.map(at, jnp.arange(span))
+
+
+def _inside(shape: tuple[int, ...], size: int) -> Bool[Array, "h w"]:
+    half, (height, width) = size // 2, shape
+    row, column = jnp.arange(height), jnp.arange(width)
+    rows, columns = (row >= half) & (row < height - half), (column >= half) & (column < width - half)
+    return rows[:, None] & columns[None, :]
+
+
+def _is_unique(costs: Array, best: Array, lowest: Array, margin: float) -> Bool[Array, "h w"]:
+    """Whether no disparity but the best and its neighbors is nearly as cheap."""
+
+    def rival(d: Any, least: Array) -> Array:
+        return jnp.where(jnp.abs(best - d) <= 1, least, jnp.minimum(least, costs[d]))
+
+    rest = lax.stop_gradient(lax.fori_loop(0, costs.shape[0], rival, jnp.full_like(lowest, _OUTSIDE)))
+    return rest > (1.0 + margin) * lowest
+
+
+def _agrees(costs: Array, best: Array, tolerance: float) -> Bool[Array, "h w"]:
+    """Whether the right picture's pixel finds its way back."""
+    span, height, width = costs.shape
+
+    def back(d: Any, carried: tuple[Array, Array]) -> tuple[Array, Array]:
+        least, chosen = carried
+        padded = jnp.pad(costs[d], ((0, 0), (0, span)), constant_values=_OUTSIDE)
+        cost = lax.dynamic_slice_in_dim(padded, d, width, axis=1)
+        return jnp.minimum(cost, least), jnp.where(cost < least, d, chosen)
+
+    start = jnp.full((height, width), 2.0 * _OUTSIDE, costs.dtype), jnp.zeros((height, width), best.dtype)
+    _, chosen = lax.stop_gradient(lax.fori_loop(0, span, back, start))
+    partner = jnp.clip(jnp.arange(width)[None, :] - best, 0, width - 1)
+    apart = jnp.abs(jnp.take_along_axis(chosen, partner, axis=1) - best)
+    return apart.astype(costs.dtype) <= tolerance
+
+
+class DenseRefinement(eqx.Module):
+    """How disparities are refined.
+
+    Attributes:
+        patches: window, reach and trust.
+        most: greatest correction that is believed, px: more is another surface.
+    """
+
+    patches: subpixel.PatchRefinement = subpixel.PatchRefinement(size=7, reach=1, num_steps=3, min_correlation=0.7)
+    most: float = eqx.field(static=True, default=0.5)
+
+
+@eqx.filter_jit
+def refine(
+    left: Float[Array, "h w"],
+    right: Float[Array, "h w"],
+    found: DisparityMap,
+    *,
+    options: DenseRefinement = DenseRefinement(),  # noqa: B008 (an immutable record)
+) -> DisparityMap:
+    """Refines disparities to subpixels, with gain and bias of every window free: the steps of 1/16 px vanish.
+
+    Args:
+        left: left picture, grey levels.
+        right: right picture.
+        found: disparities within a pixel of the truth.
+        options: window, trust, and the greatest correction.
+
+    Returns:
+        The map with the refined disparities and their variance where the refinement is to be trusted, and as it was
+        elsewhere. Gradients are those of the minimum.
+
+    References:
+        `images.subpixel.refine_stereo` [T-10].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> u, v = jnp.meshgrid(jnp.arange(60.0), jnp.arange(20.0))
+        >>> scene = lambda u: 100 + 50 * jnp.sin(0.5 * u) * jnp.cos(0.4 * v)
+        >>> whole = jnp.full((20, 60), 4.0)
+        >>> guess = jl.multiview.disparity.DisparityMap(whole, jnp.ones_like(whole), whole > 0)
+        >>> found = jl.multiview.disparity.refine(scene(u), 0.8 * scene(u + 4.3) + 9, guess)
+        >>> round(float(found.disparity[10, 30]), 1)
+        4.3
+    """
+    left, right = (jnp.where(jnp.isfinite(image), image, 0.0) for image in (left, right))
+    height, width = left.shape
+    columns = jnp.arange(width, dtype=left.dtype)
+    disparity = found.disparity.astype(left.dtype)
+
+    def row(item: tuple[Array, Array]) -> subpixel.RefinedColumns:
+        index, shifts = item
+        rows = jnp.full_like(columns, index)
+        uv_left, uv_right = jnp.stack([columns, rows], axis=1), jnp.stack([columns - shifts, rows], axis=1)
+        return subpixel.refine_stereo(left, right, uv_left, uv_right, options=options.patches)
+
+    refined = lax.map(row, (jnp.arange(height, dtype=left.dtype), disparity))
+    moved = columns[None, :] - refined.uv[:, :, 0]
+    better = found.valid & refined.ok & (jnp.abs(moved - disparity) <= options.most)
+    variance = jnp.where(better, refined.variance, found.variance.astype(left.dtype))
+    return DisparityMap(jnp.where(better, moved, disparity), variance, found.valid)
