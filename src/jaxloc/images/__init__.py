@@ -1,6 +1,7 @@
 """Pixels to samples, keypoints and matches."""
 
 from jaxloc.images import (
+    blobs,
     chessboard,
     corners,
     describe,
@@ -36,6 +37,7 @@ __all__ = [
     "Similarity",
     "Translation",
     "Warp",
+    "blobs",
     "chessboard",
     "corners",
     "describe",
