@@ -1,6 +1,7 @@
 """Files and synthetic worlds that give the library's own records."""
 
 from jaxloc.data import (
+    bundle,
     camera_file,
     carmen,
     covariance,
@@ -35,6 +36,7 @@ __all__ = [
     "StereoPairs",
     "StereoSequence",
     "StreetSequence",
+    "bundle",
     "camera_file",
     "carmen",
     "covariance",

@@ -1,6 +1,6 @@
 """Features to pose: residuals of what a camera sees, and the poses that explain it best."""
 
-from jaxloc.refinement import calibration, reprojection, resection
+from jaxloc.refinement import bundle, calibration, reprojection, resection
 from jaxloc.refinement.reprojection import Reprojection, StereoReprojection
 from jaxloc.refinement.resection import StereoMatches, motion_problem, refine_motion, refine_pose
 
@@ -8,6 +8,7 @@ __all__ = [
     "Reprojection",
     "StereoMatches",
     "StereoReprojection",
+    "bundle",
     "calibration",
     "motion_problem",
     "refine_motion",

@@ -1,0 +1,131 @@
+"""What bundle adjustment returns: a bundle, whether to believe it, and how sure chosen parts of it are."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxloc.beliefs import Gaussian
+from jaxloc.poses import SE3
+from jaxloc.refinement.bundle.problem import Bundle, BundleProblem
+from jaxloc.refinement.bundle.schur import Eliminated, Tangent, eliminate, normal_equations
+from jaxloc.refinement.bundle.structure import Structure
+from jaxloc.solvers import Estimate, Status
+from jaxloc.solvers.linear import factor
+
+
+class BundleEstimate(eqx.Module):
+    """The answer of bundle adjustment.
+
+    It is no `jaxloc.solvers.Estimate`, since the covariance of all unknowns would hold the square of three numbers a
+    point: gigabytes. Covariances of the poses and points that are asked for are made on demand, and `pose_estimate`
+    gives what filters and pose graphs accept. They are inverses of the Gauss-Newton Hessian (under robust kernels of
+    the weighted one), that is, they hold if sigmas are right.
+
+    Attributes:
+        value: poses and points.
+        cost: the objective at the value, the sum of rho.
+        ok: whether the value can be used. Gradients are zero where it is False.
+        num_steps: steps taken, those that were refused too.
+        status: a `jaxloc.solvers.Status`.
+        point_ok: points that their rays determine; the others keep their start.
+        problem: what was minimized.
+        structure: its tables.
+    """
+
+    value: Bundle
+    cost: Float[Array, ""]
+    ok: Bool[Array, ""]
+    num_steps: Int[Array, ""]
+    status: Int[Array, ""]
+    point_ok: Bool[Array, " n"]
+    problem: BundleProblem
+    structure: Structure
+
+    @eqx.filter_jit
+    def pose_covariance(self, cameras: Int[Array, " q"]) -> Float[Array, "q 6 q 6"]:
+        """Joint covariance of chosen poses in their tangents (right perturbation); zero for fixed ones.
+
+        Args:
+            cameras: "q", numbers of the cameras.
+
+        Returns:
+            Covariance of camera ``cameras[i]`` with ``cameras[j]`` at ``[i, :, j, :]``, m and rad. Where directions are
+            undetermined it is finite and without meaning.
+        """
+        inverse = self._factored().system.inverse()
+        size = self.value.poses.batch_shape[0]
+        blocks = inverse.reshape(size, 6, size, 6)[cameras][:, :, cameras]
+        free = ~self.problem.gauge.fixed[cameras]
+        return jnp.where((free[:, None] & free[None, :])[:, None, :, None], _finite(blocks), 0.0)
+
+    @eqx.filter_jit
+    def point_covariance(self, points: Int[Array, " q"]) -> Float[Array, "q 3 3"]:
+        """Covariance of each of chosen points, world frame, m^2.
+
+        Args:
+            points: "q", numbers of the points.
+
+        Returns:
+            Covariances; zero along directions that are undetermined (see ``point_ok``).
+        """
+        eliminated = self._factored()
+        zero = Tangent(
+            jnp.zeros((self.value.poses.batch_shape[0], 6), self.cost.dtype), jnp.zeros_like(self.value.points)
+        )
+
+        def column(point: Int[Array, ""], axis: Int[Array, ""]) -> Float[Array, "3"]:
+            unit = eqx.tree_at(lambda tangent: tangent.points, zero, zero.points.at[point, axis].set(1.0))
+            return eliminated.solve(unit).points[point]
+
+        axes = jnp.arange(3)
+        # One after the other: a solution is as long as the whole bundle.
+        return _finite(jax.lax.map(lambda point: jax.lax.map(lambda axis: column(point, axis), axes), points))
+
+    def pose_gaussian(self, camera: Any) -> Gaussian:
+        """The pose of one camera as a density: what filters and pose graphs accept."""
+        return self.pose_estimate(camera).gaussian()
+
+    def pose_estimate(self, camera: Any) -> Estimate:
+        """The pose of one camera, the others and all points marginalized; value, covariance and status of an Estimate.
+
+        Args:
+            camera: its number.
+
+        Returns:
+            Estimate of ``T_world_camera``. Its cost is that of the whole bundle.
+        """
+        return self._pose_estimate(jnp.asarray(camera, jnp.int32))
+
+    @eqx.filter_jit
+    def _pose_estimate(self, index: Int[Array, ""]) -> Estimate:
+        pose: SE3 = jax.tree.map(lambda leaf: leaf[index], self.value.poses)
+        covariance = self.pose_covariance(index[None])[0, :, 0, :]
+        information = factor(covariance).inverse()
+        return Estimate(pose, covariance, self.cost, self.ok, self.num_steps, self.status, information)
+
+    def describe(self) -> str:
+        """One line for people: how it ended (host only)."""
+        lost = int(jnp.sum(~self.point_ok))
+        status = Status(int(self.status)).name.lower().replace("_", " ")
+        return f"{status} ({int(self.num_steps)} steps, cost {float(self.cost):.6g}, {lost} points undetermined)"
+
+    def check(self) -> "BundleEstimate":
+        """Itself, when it is ok (host only).
+
+        Raises:
+            ValueError: it is not; the message says why.
+        """
+        if not bool(self.ok):
+            raise ValueError(f"The bundle is not usable: {self.describe()}.")
+        return self
+
+    def _factored(self) -> Eliminated:
+        _, _, arrow = normal_equations(self.problem, self.value, self.structure)
+        return eliminate(arrow, self.structure)
+
+
+def _finite(array: Array) -> Array:
+    return jnp.where(jnp.isfinite(array), array, 0.0)

@@ -1,0 +1,276 @@
+"""A bundle of rays: cameras, points, what the cameras saw of them, and what holds the whole in place.
+
+Observations lie along the last axis here, components along the first: that is how the inner loops run fast.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxloc.poses import SE3
+from jaxloc.poses.group import matmul
+from jaxloc.refinement.bundle.structure import Structure
+from jaxloc.sensors import Pinhole, StereoRig
+from jaxloc.solvers import Loss, Quadratic
+
+# Residual, in sigmas, of a point that the camera cannot see: dear, so that no step hides points behind a camera.
+_UNSEEN = 1e3
+
+
+class Observations(eqx.Module):
+    """What cameras saw of points; a fixed number of slots, of which some may be empty.
+
+    Attributes:
+        camera: "m", number of the camera.
+        point: "m", number of the point.
+        measured: "m k", px: (u, v) of a camera, (u_left, u_right, v) of a stereo rig.
+        sigma: "m k", standard deviation of each coordinate, px.
+        valid: slots that count; the numbers of others, nan too, have no influence.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jaxloc.refinement.bundle.problem import Observations
+        >>> Observations.of(jnp.array([0, 1]), jnp.array([0, 0]), jnp.zeros((2, 3)), sigma=0.5).sigma.shape
+        (2, 3)
+    """
+
+    camera: Int[Array, " m"]
+    point: Int[Array, " m"]
+    measured: Float[Array, "m k"]
+    sigma: Float[Array, "m k"]
+    valid: Bool[Array, " m"]
+
+    @staticmethod
+    def of(camera: Any, point: Any, measured: Any, *, sigma: Any = 1.0, valid: Any = None) -> "Observations":
+        """Observations with one sigma for all (or "k" for the components, or "m k"), all of them valid by default."""
+        measured = jnp.asarray(measured)
+        sigma = jnp.asarray(sigma, measured.dtype)
+        lead = (1,) * (measured.ndim - sigma.ndim)
+        valid = jnp.ones(measured.shape[:1], bool) if valid is None else jnp.asarray(valid)
+        index = (jnp.asarray(camera, jnp.int32), jnp.asarray(point, jnp.int32))
+        return Observations(
+            *index, measured, jnp.broadcast_to(sigma.reshape(lead + sigma.shape), measured.shape), valid
+        )
+
+
+class Bundle(eqx.Module):
+    """The unknowns.
+
+    Attributes:
+        poses: stack of c poses ``T_world_camera`` (of the left cameras).
+        points: "n 3", world frame, m.
+    """
+
+    poses: SE3
+    points: Float[Array, "n 3"]
+
+    def moved(self, cameras: Float[Array, "c 6"], points: Float[Array, "n 3"]) -> "Bundle":
+        """Poses moved along tangents (right perturbation), points by addition."""
+        return Bundle(jax.vmap(lambda pose, delta: pose.retract(delta))(self.poses, cameras), self.points + points)
+
+
+class Gauge(eqx.Module):
+    """What holds a bundle in place: sights say nothing about where the whole is, nor, from one camera, how large.
+
+    Attributes:
+        fixed: cameras that stay where they start.
+        anchors: poses that others are drawn to, or None.
+        information: how strongly, in the tangent of the anchors; zero where a camera is free.
+    """
+
+    fixed: Bool[Array, " c"]
+    anchors: SE3 | None = None
+    information: Float[Array, "c 6 6"] | None = None
+
+    @staticmethod
+    def fix(num_cameras: int, *cameras: int) -> "Gauge":
+        """Fixed cameras: one for a stereo rig; two for a single camera, whose distance then sets the scale."""
+        return Gauge(jnp.zeros(num_cameras, bool).at[jnp.asarray(cameras, jnp.int32)].set(True))
+
+    @staticmethod
+    def prior(poses: SE3, covariance: Float[Array, "c 6 6"], valid: Bool[Array, " c"]) -> "Gauge":
+        """Poses known beforehand, each with a covariance, where ``valid``."""
+        eye = jnp.eye(6, dtype=covariance.dtype)
+        safe = jnp.where(valid[:, None, None], covariance, eye[None])
+        information = jnp.where(valid[:, None, None], jnp.linalg.inv(safe), 0.0)
+        return Gauge(jnp.zeros(valid.shape, bool), poses, information)
+
+    def cost(self, poses: SE3) -> Float[Array, ""]:
+        """Half the squared distance from the anchors."""
+        if self.anchors is None or self.information is None:
+            return jnp.zeros((), poses.translation.dtype)
+        return jnp.sum(jax.vmap(_anchor_cost)(poses, self.anchors, self.information))
+
+    def slopes(self, poses: SE3) -> Float[Array, "c 6"]:
+        """Derivative of the cost along the tangents of the poses."""
+        if self.anchors is None or self.information is None:
+            return jnp.zeros((*poses.batch_shape, 6), poses.translation.dtype)
+        return jax.vmap(_anchor_slope)(poses, self.anchors, self.information)
+
+    def curvatures(self, poses: SE3, exact: bool) -> Float[Array, "c 6 6"]:
+        """Second derivative of the cost: Gauss and Newton's, or exact."""
+        if self.anchors is None or self.information is None:
+            return jnp.zeros((*poses.batch_shape, 6, 6), poses.translation.dtype)
+
+        def curvature(pose: SE3, anchor: SE3, information: Array) -> Array:
+            if exact:
+                slope = jax.jacfwd(lambda delta: _anchor_slope(pose.retract(delta), anchor, information))
+                bent = slope(jnp.zeros(6, information.dtype))
+                return 0.5 * (bent + bent.T)
+            jacobian = SE3.left_jacobian_inverse(-anchor.local(pose))
+            return matmul(jacobian.T, matmul(information, jacobian))
+
+        return jax.vmap(curvature)(poses, self.anchors, self.information)
+
+
+def _anchor_cost(pose: SE3, anchor: SE3, information: Float[Array, "6 6"]) -> Float[Array, ""]:
+    distance = anchor.local(pose)
+    return 0.5 * jnp.sum(distance * matmul(information, distance))
+
+
+def _anchor_slope(pose: SE3, anchor: SE3, information: Float[Array, "6 6"]) -> Float[Array, "6"]:
+    distance = anchor.local(pose)
+    return matmul(SE3.left_jacobian_inverse(-distance).T, matmul(information, distance))
+
+
+class Sights(eqx.Module):
+    """A bundle seen from its cameras: the cost of each observation as a function of the point in the camera's frame.
+
+    Attributes:
+        cost: of all observations, and of those that are hidden.
+        seen: observations whose point the camera sees.
+        frame: points in the frames of the cameras; safe where unseen.
+        rotation: of the cameras.
+        slope: derivative of the cost in the frame of the camera; zero where unseen.
+        curvature: second derivative of the cost.
+    """
+
+    cost: Float[Array, ""]
+    seen: Bool[Array, " m"]
+    frame: Float[Array, "3 m"]
+    rotation: Float[Array, "3 3 m"]
+    slope: Float[Array, "3 m"]
+    curvature: Float[Array, "3 3 m"]
+
+
+class BundleProblem(eqx.Module):
+    """``sum rho(|W (h(T_c^-1 X_p) - z)|^2)`` over observations, and the cost of the gauge.
+
+    Attributes:
+        model: the camera or stereo rig that took every picture.
+        camera: of each observation.
+        point: of each observation.
+        measured: "k m", px; finite everywhere.
+        inverse_sigma: "k m", 1/px; finite everywhere.
+        usable: observations that count.
+        gauge: what holds the bundle in place.
+        loss: robust kernel over the components of an observation.
+    """
+
+    model: Pinhole | StereoRig
+    camera: Int[Array, " m"]
+    point: Int[Array, " m"]
+    measured: Float[Array, "k m"]
+    inverse_sigma: Float[Array, "k m"]
+    usable: Bool[Array, " m"]
+    gauge: Gauge
+    loss: Loss = Quadratic()
+
+    @staticmethod
+    def of(model: Any, start: Bundle, observations: Observations, gauge: Gauge, loss: Loss) -> "BundleProblem":
+        """The problem, with observations masked that are bad numbers, or whose point has too few rays."""
+        measured, sigma = observations.measured, observations.sigma
+        camera, point = observations.camera, observations.point
+        good = jnp.all(jnp.isfinite(measured) & jnp.isfinite(sigma) & (sigma > 0), axis=1) & observations.valid
+        cameras, points = start.poses.batch_shape[0], start.points.shape[0]
+        good = good & (camera >= 0) & (camera < cameras) & (point >= 0) & (point < points)
+        camera, point = jnp.where(good, camera, 0), jnp.where(good, point, 0)
+        good = good & jnp.all(jnp.isfinite(start.points), axis=1)[point]
+        rays = jax.ops.segment_sum(good.astype(jnp.int32), point, points)
+        good = good & (rays >= (1 if isinstance(model, StereoRig) else 2))[point]
+        safe = jnp.where(good[:, None], measured, 0.0), 1.0 / jnp.where(good[:, None], sigma, 1.0)
+        return BundleProblem(model, camera, point, safe[0].T, safe[1].T, good, gauge, loss)
+
+    def project(self, frame: Float[Array, "3 m"]) -> Float[Array, "k m"]:
+        """What the camera shows of points in its frame."""
+        shown = self.model.project_components(frame[0], frame[1], frame[2])
+        return shown if isinstance(self.model, StereoRig) else jnp.stack(shown)
+
+    def frames(self, state: Bundle) -> tuple[Float[Array, "3 m"], Float[Array, "3 3 m"], Bool[Array, " m"]]:
+        """Points in the frames of the cameras that see them, the cameras' rotations, and whether they do see them."""
+        rotation = jnp.moveaxis(state.poses.rotation.rotation_matrix, 0, -1)[:, :, self.camera]
+        arm = state.points.T[:, self.point] - state.poses.translation.T[:, self.camera]
+        moved = jnp.sum(rotation * arm[:, None, :], axis=0)
+        camera = self.model.camera if isinstance(self.model, StereoRig) else self.model
+        seen = self.usable & camera.in_front_components(moved[0], moved[1], moved[2])
+        ahead = jnp.array([0.0, 0.0, 1.0], moved.dtype)[:, None]
+        return jnp.where(seen[None], moved, ahead), rotation, seen
+
+    def item_cost(self, frame: Float[Array, "3 m"]) -> Float[Array, " m"]:
+        """Cost of each observation with its point at a place in the frame of its camera."""
+        error = (self.project(frame) - self.measured) * self.inverse_sigma
+        return self.loss.rho(jnp.sum(error**2, axis=0))
+
+    def cost(self, state: Bundle) -> Float[Array, ""]:
+        """The exact objective; points behind a camera that sees them are dear."""
+        frame, _, seen = self.frames(state)
+        return self._total(self.item_cost(frame), seen) + self.gauge.cost(state.poses)
+
+    def _total(self, items: Float[Array, " m"], seen: Bool[Array, " m"]) -> Float[Array, ""]:
+        hidden = self.loss.rho(jnp.full((1,), _UNSEEN**2, items.dtype))
+        return jnp.sum(jnp.where(seen, items, jnp.where(self.usable, hidden, 0.0)))
+
+    def sights(self, state: Bundle, *, near: Any = True, exact: bool = False) -> Sights:
+        """Cost, slope and curvature of each observation.
+
+        Curvatures are positive semidefinite: what falling weights of robust kernels take off counts ``near`` a minimum
+        alone, and is bounded so that a tenth is left. The exact ones need not be.
+        """
+        frame, rotation, seen = self.frames(state)
+        error = (self.project(frame) - self.measured) * self.inverse_sigma
+        squared = jnp.sum(error**2, axis=0)
+        jacobian = self.inverse_sigma[None] * _along_axes(self.project, frame)
+        weight, fall = jax.jvp(self.loss.weight, (squared,), (jnp.ones_like(squared),))
+        score = jnp.sum(jacobian * error[None], axis=1)
+        if exact:
+            curvature = _along_axes(lambda c: jax.vjp(self.item_cost, c)[1](jnp.ones_like(squared))[0], frame)
+        else:
+            positive = squared > 0
+            fall = jnp.where(
+                positive & near, jnp.maximum(2.0 * fall, -0.9 * weight / jnp.where(positive, squared, 1.0)), 0.0
+            )
+            curvature = weight[None, None] * jnp.sum(jacobian[:, None] * jacobian[None], axis=2)
+            curvature = curvature + (fall[None] * score)[:, None] * score[None]
+        slope = jnp.where(seen[None], weight[None] * score, 0.0)
+        curvature = jnp.where(seen[None, None], curvature, 0.0)
+        return Sights(self._total(self.loss.rho(squared), seen), seen, frame, rotation, slope, curvature)
+
+    def gradient(self, state: Bundle, structure: Structure) -> tuple[Float[Array, "c 6"], Float[Array, "n 3"]]:
+        """Derivative of the exact objective along the tangents of the cameras and of the points."""
+        sights = self.sights(state)
+        on_points = jnp.sum(sights.rotation * sights.slope[None], axis=1)
+        cameras = jax.ops.segment_sum(pose_rows(sights.slope, sights.frame).T, self.camera, structure.by_camera.count)
+        points = jax.ops.segment_sum(on_points.T, self.point, structure.by_point.count)
+        cameras = jnp.where(self.gauge.fixed[:, None], 0.0, cameras + self.gauge.slopes(state.poses))
+        return cameras, points
+
+    def admissible(self, state: Bundle) -> Bool[Array, ""]:
+        """Whether every point is ahead of the cameras that see it; robust kernels take others for outliers."""
+        return jnp.all(self.frames(state)[2] == self.usable) | ~jnp.array(isinstance(self.loss, Quadratic))
+
+
+def _along_axes(function: Any, frame: Float[Array, "3 m"]) -> Float[Array, "3 k m"]:
+    """Derivative of a function of points: direction first, then what the function gives."""
+    axes = jnp.eye(3, dtype=frame.dtype)
+    push = lambda axis: jax.jvp(function, (frame,), (jnp.broadcast_to(axis[:, None], frame.shape),))[1]  # noqa: E731
+    return jnp.stack([push(axes[i]) for i in range(3)])
+
+
+def pose_rows(slope: Float[Array, "3 *k m"], frame: Float[Array, "3 m"]) -> Float[Array, "6 *k m"]:
+    """Chain rule to the pose's tangent: a right perturbation (v, w) moves the point by ``-v + c x w``."""
+    gx, gy, gz = slope[0], slope[1], slope[2]
+    x, y, z = (jnp.broadcast_to(component, gx.shape) for component in frame)
+    return jnp.stack([-gx, -gy, -gz, gy * z - gz * y, gz * x - gx * z, gx * y - gy * x])
