@@ -185,10 +185,17 @@ class TransferError(Problem):
 
     def residual(self, state: Homography) -> Float[Array, "2 n"]:
         """Whitened errors; a point that maps behind the horizon counts as a gross error."""
-        return _whitened(state.homogeneous, self.first, self.second, self.sigma, self.valid)
+        return transfer_error(state.homogeneous, self.first, self.second, self.sigma, self.valid)
 
 
-def _whitened(matrix: Array, first: Array, second: Array, sigma: Array, valid: Array) -> Float[Array, "2 n"]:
+def transfer_error(
+    matrix: Float[Array, "3 3"],
+    first: Float[Array, "2 n"],
+    second: Float[Array, "2 n"],
+    sigma: Any,
+    valid: Bool[Array, " n"],
+) -> Float[Array, "2 n"]:
+    """What `TransferError` whitens, of any matrix: 1000 sigmas behind the horizon, zero where masked."""
     x, y, w = matmul(matrix[:, :2], first) + matrix[:, 2:]
     # The sign of the determinant is one: points of the plane that both cameras see have positive w.
     ahead = valid & (w > float(jnp.finfo(w.dtype).eps))
@@ -214,7 +221,7 @@ def _fit_sample(sample: tuple[Array, Array, Array]) -> Homography:
 def _distance(model: Homography, data: tuple[Array, Array, Array]) -> Float[Array, " n"]:
     first, second, sigma = data
     everyone = jnp.ones(first.shape[:1], bool)
-    return jnp.sqrt(jnp.sum(_whitened(model.homogeneous, first.T, second.T, sigma[0], everyone) ** 2, axis=0))
+    return jnp.sqrt(jnp.sum(transfer_error(model.homogeneous, first.T, second.T, sigma[0], everyone) ** 2, axis=0))
 
 
 @eqx.filter_jit

@@ -1,0 +1,243 @@
+"""What two views say of each other: essential and fundamental matrices, lines, epipoles and errors.
+
+The convention throughout: ``x1^T M x2 = 0`` for a point seen at ``x1`` by the first camera and at ``x2`` by the second.
+With ``T_first_second = (R, t)``, the essential matrix is ``E = [t] R`` (OpenCV's and PoseLib's are its transpose), and
+``F = K1^-T E K2^-1``.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxloc.poses import SE3, SO3, Direction
+from jaxloc.poses.group import matmul, skew
+from jaxloc.sensors import Pinhole
+from jaxloc.solvers import Problem, Quadratic
+
+
+class RelativePose(eqx.Module):
+    """The pose of a second camera in the frame of the first, but for the length of the translation.
+
+    A state of five degrees of freedom: the essential matrix stays on its manifold, whatever step is taken.
+
+    Attributes:
+        direction: of the translation, frame of the first camera.
+        rotation: from the second camera's frame to the first's.
+    """
+
+    direction: Direction
+    rotation: SO3
+
+    @staticmethod
+    def of(pose: SE3) -> "RelativePose":
+        """A pose without the length of its translation."""
+        return RelativePose(Direction.from_vector(pose.translation), pose.rotation)
+
+    def essential(self) -> Float[Array, "3 3"]:
+        """``E = [t] R`` with singular values one, one and zero."""
+        return matmul(skew(self.direction.vector), self.rotation.matrix())
+
+    def pose(self, length: Any = 1.0) -> SE3:
+        """``T_first_second`` with a translation of a length, m."""
+        return SE3(self.rotation, self.direction.vector * length)
+
+
+def fundamental(essential: Float[Array, "3 3"], first: Pinhole, second: Pinhole) -> Float[Array, "3 3"]:
+    """``F = K1^-T E K2^-1``, for pixels without lens, of unit Frobenius norm.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> camera = jl.sensors.Pinhole(100.0, 100.0, 50.0, 50.0)
+        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> jl.multiview.epipolar.fundamental(sideways, camera, camera).round(2).tolist()[2]
+        [0.0, 0.7099999785423279, 0.0]
+    """
+    inverse = [jnp.linalg.inv(camera.matrix()) for camera in (first, second)]
+    matrix = matmul(inverse[0].T, matmul(essential, inverse[1]))
+    squared = jnp.sum(matrix * matrix)
+    return matrix / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+
+
+def homogeneous(points: Float[Array, "n 2"]) -> Float[Array, "3 n"]:
+    """Points with a third coordinate of one, along the last axis."""
+    return jnp.concatenate([points.T, jnp.ones_like(points.T[:1])])
+
+
+@eqx.filter_jit
+def epipolar_lines(matrix: Float[Array, "3 3"], second: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+    """Lines ``a u + b v + c = 0`` of the first picture on which points of the second lie; ``a^2 + b^2 = 1``.
+
+    For lines of the second picture give the transposed matrix and points of the first.
+
+    References:
+        Review eq. 20 [R-48]; thesis figure 2.3 [T-20].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> jl.multiview.epipolar.epipolar_lines(sideways, jnp.array([[5.0, 3.0]])).tolist()  # v = 3
+        [[0.0, -1.0, 3.0]]
+    """
+    lines = matmul(matrix, homogeneous(second))
+    squared = lines[0] ** 2 + lines[1] ** 2
+    return (lines / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))[None, :]).T
+
+
+@eqx.filter_jit
+def epipoles(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Where each camera appears in the other's picture: unit homogeneous points with ``e1^T M = 0``, ``M e2 = 0``.
+
+    Args:
+        matrix: fundamental or essential, of rank two.
+
+    Returns:
+        The image of the second camera's center in the first picture, and that of the first's in the second.
+
+    References:
+        Thesis figure 2.3 [T-20].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> ahead = jl.poses.group.skew(jnp.array([0.0, 0.0, 1.0]))
+        >>> [jnp.abs(e).tolist() for e in jl.multiview.epipolar.epipoles(ahead)]
+        [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]
+    """
+    return null_vector(matrix.T), null_vector(matrix)
+
+
+def null_vector(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Unit vector at right angles to the rows of a matrix of rank two: the largest of their cross products."""
+    a, b, c = matrix
+    products = jnp.stack([jnp.cross(a, b), jnp.cross(b, c), jnp.cross(c, a)])
+    squares = jnp.sum(products * products, axis=1)
+    best = jnp.argmax(squares)
+    known = squares[best] > 0
+    vector = jnp.where(known, products[best], jnp.array([0.0, 0.0, 1.0], matrix.dtype))
+    return vector / jnp.sqrt(jnp.where(known, squares[best], 1.0))
+
+
+def coplanarity(
+    matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "n 2"]
+) -> Float[Array, " n"]:
+    """``x1^T M x2``: the volume that both rays and the baseline span; zero for rays that meet.
+
+    References:
+        Longuet-Higgins 1981; review eq. 19, ``(P_l - T) . T x P_l = 0`` [R-47].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> jl.multiview.epipolar.coplanarity(sideways, jnp.array([[2.0, 3.0]]), jnp.array([[5.0, 3.0]])).tolist()
+        [0.0]
+    """
+    return jnp.sum(homogeneous(first) * matmul(matrix, homogeneous(second)), axis=0)
+
+
+def sampson_components(matrix: Array, x1: Float[Array, "3 n"], x2: Float[Array, "3 n"]) -> Float[Array, " n"]:
+    """`sampson_distance` of homogeneous points along the last axis."""
+    line1, line2 = matmul(matrix, x2), matmul(matrix.T, x1)
+    error = jnp.sum(x1 * line1, axis=0)
+    squared = line1[0] ** 2 + line1[1] ** 2 + line2[0] ** 2 + line2[1] ** 2
+    some = squared > float(jnp.finfo(squared.dtype).tiny) ** 0.5
+    return jnp.where(some, error, 0.0) / jnp.sqrt(jnp.where(some, squared, 1.0))
+
+
+@eqx.filter_jit
+def sampson_distance(
+    matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "n 2"]
+) -> Float[Array, " n"]:
+    """How far a pair of points has to move, to first order, until its rays meet; signed, in the points' unit.
+
+    Args:
+        matrix: fundamental (points in px) or essential (normalized coordinates).
+        first: points of the first picture.
+        second: their partners.
+
+    References:
+        Sampson 1982; Hartley and Zisserman, *Multiple View Geometry*, 2004, eq. 11.9 [R-48].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> off = jl.multiview.epipolar.sampson_distance(sideways, jnp.array([[2.0, 3.0]]), jnp.array([[5.0, 4.0]]))
+        >>> round(abs(float(off[0])), 3)  # half a pixel each: sqrt(1/2) for both
+        0.707
+    """
+    return sampson_components(matrix, homogeneous(first), homogeneous(second))
+
+
+@eqx.filter_jit
+def symmetric_distance(
+    matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "n 2"]
+) -> Float[Array, " n"]:
+    """Root of the summed squared distances of both points from their epipolar lines.
+
+    References:
+        Hartley and Zisserman 2004, eq. 11.10.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> off = jl.multiview.epipolar.symmetric_distance(sideways, jnp.array([[2.0, 3.0]]), jnp.array([[5.0, 4.0]]))
+        >>> round(float(off[0]), 3)
+        1.414
+    """
+    lines = epipolar_lines(matrix, second), epipolar_lines(matrix.T, first)
+    apart = [jnp.sum(homogeneous(p) * line.T, axis=0) for p, line in zip((first, second), lines, strict=True)]
+    squared = apart[0] ** 2 + apart[1] ** 2
+    some = squared > 0
+    return jnp.where(some, jnp.sqrt(jnp.where(some, squared, 1.0)), 0.0)
+
+
+@eqx.filter_jit
+def epipolar_gate(
+    matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "m 2"], *, band: Any = 2.0
+) -> Bool[Array, "n m"]:
+    """Candidates near each other's epipolar lines: what `images.match.match` takes as its gate.
+
+    Args:
+        matrix: fundamental matrix.
+        first: keypoints of the first picture, px.
+        second: keypoints of the second.
+        band: greatest Sampson distance, px.
+
+    Returns:
+        Which pairs may belong together: a search along a line instead of over the picture [R-46].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> points = jnp.array([[2.0, 3.0], [7.0, 30.0]])
+        >>> jl.multiview.epipolar.epipolar_gate(sideways, points, points[::-1]).tolist()
+        [[False, True], [True, False]]
+    """
+    x1, x2 = homogeneous(first), homogeneous(second)
+    line1, line2 = matmul(matrix, x2), matmul(matrix.T, x1)
+    error = matmul(x1.T, line1)
+    squared = (line1[0] ** 2 + line1[1] ** 2)[None, :] + (line2[0] ** 2 + line2[1] ** 2)[:, None]
+    return error * error <= jnp.asarray(band, error.dtype) ** 2 * squared
+
+
+class EpipolarError(Problem):
+    """Corresponding rays of two calibrated views; the state is the `RelativePose`.
+
+    Attributes:
+        first: "3 n", homogeneous normalized points of the first view; finite everywhere.
+        second: "3 n", of the second.
+        sigma: standard deviation of a coordinate, normalized: px over focal length.
+        valid: which count.
+        loss: robust kernel.
+    """
+
+    first: Float[Array, "3 n"]
+    second: Float[Array, "3 n"]
+    sigma: Float[Array, ""]
+    valid: Bool[Array, " n"]
+    loss: Any = Quadratic()
+
+    def residual(self, state: RelativePose) -> Float[Array, "1 n"]:
+        """Whitened Sampson distances."""
+        error = sampson_components(state.essential(), self.first, self.second) / self.sigma
+        return jnp.where(self.valid, error, 0.0)[None, :]
