@@ -1,0 +1,150 @@
+"""Poses from matched features of every kind: points, lines and segments, in the plane and in space, in one problem.
+
+Features of a source frame are brought to the target frame by ``T = T_target_source`` and compared with their partners
+there. Each kind of pair leaves a difference vector, of which some directions count:
+
+| pair | what is compared | cost dofs in the plane | in space |
+|---|---|---|---|
+| point to point | all of ``T s - t`` | 2 | 3 |
+| point to line | the part of ``T s - p`` across the line | 1 | 2 |
+| point to segment | the way to the nearest point, ends included | 1 (2 beyond an end) | 2 (3) |
+| segment to segment | both ends of the source across the target's line | 2 | 4 |
+| line to line | the sine of the angle between the directions | 1 | 2 |
+
+Segments are cut where a detector lost them, so their ends tell nothing along them: what is left in the plane is the
+distance across and the angle, two dofs. Lines without ends tell the angle; where the place of a line is known too, any
+of its points is a point-to-line pair. Ends that are known are point-to-point pairs.
+
+References:
+    A. Kelly, *Mobile Robotics*, lecture 9.2.3.4, four kinds of planar correspondences [K-56, K-57]; 9.2.3.7 for the
+    nearest point of a segment [K-63].
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float
+
+from jaxloc.poses import SE2, SE3
+from jaxloc.refinement.feature_pairs import (
+    LineLine,
+    Pairs,
+    PointLine,
+    PointPoint,
+    PointSegment,
+    SegmentSegment,
+    nearest_on_segment,
+)
+from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Problem, Quadratic, Solver, solve
+
+__all__ = [
+    "Correspondences",
+    "LineLine",
+    "Mixed",
+    "Pairs",
+    "PointLine",
+    "PointPoint",
+    "PointSegment",
+    "SegmentSegment",
+    "nearest_on_segment",
+    "refine",
+]
+
+
+class Correspondences(eqx.Module):
+    """Matched features of all kinds; kinds that are missing are None.
+
+    Attributes:
+        point_point: points and points.
+        point_line: points and lines.
+        point_segment: points and segments.
+        segment_segment: segments and segments.
+        line_line: lines and lines.
+    """
+
+    point_point: PointPoint | None = None
+    point_line: PointLine | None = None
+    point_segment: PointSegment | None = None
+    segment_segment: SegmentSegment | None = None
+    line_line: LineLine | None = None
+
+    def kinds(self) -> tuple[Pairs, ...]:
+        """Those that are there, in the order of the fields.
+
+        Raises:
+            ValueError: there are none.
+        """
+        fields = (self.point_point, self.point_line, self.point_segment, self.segment_segment, self.line_line)
+        present = tuple(pairs for pairs in fields if pairs is not None)
+        if not present:
+            raise ValueError("Correspondences without any pairs: give at least one kind.")
+        return present
+
+
+class Mixed(Problem):
+    """Correspondences of all kinds at once; the state is the pose ``T_target_source``, `SE2` or `SE3` [K-57].
+
+    Attributes:
+        correspondences: the pairs.
+        loss: robust kernel over the components of a pair: one for all, or a tuple with one for each kind present.
+    """
+
+    correspondences: Correspondences
+    loss: Any = Quadratic()
+
+    def residual(self, state: SE2 | SE3) -> tuple[Float[Array, "c n"], ...]:
+        """Whitened differences of each kind."""
+        return self.linearize(state).residual
+
+    def linearize(self, state: SE2 | SE3) -> Linearization:
+        """Differences and Jacobians in closed form."""
+        parts = [pairs.linearize(state) for pairs in self.correspondences.kinds()]
+        return Linearization(tuple(part.residual for part in parts), tuple(part.jacobian for part in parts))
+
+
+@eqx.filter_jit
+def refine(
+    correspondences: Correspondences,
+    initial: SE2 | SE3,
+    *,
+    loss: Any = Quadratic(),
+    solver: Solver = LevenbergMarquardt(),
+) -> Estimate:
+    """The pose that brings features of a source frame onto their partners.
+
+    Minimizes ``sum rho(|r_k(T)|^2)`` over ``T = T_target_source`` with the whitened differences of all pairs.
+
+    Args:
+        correspondences: pairs of any kinds; numbers of pairs that do not count, nan too, have no influence.
+        initial: guess of ``T_target_source``: `SE2` for features of the plane, `SE3` for those of space.
+        loss: robust kernel, or one for each kind present.
+        solver: how to minimize.
+
+    Returns:
+        Estimate of the pose, covariance in its tangent. ``ok`` is False when the pairs leave a direction open, as
+        lines do that are all parallel.
+
+    Raises:
+        ValueError: no pairs, or features and pose of different dimension.
+
+    References:
+        KELLY 9.2.3.4, 9.2.4.2 [K-57, K-73]. Source and target change places by the inverse pose [K-15].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> from jaxloc.refinement.correspondences import Correspondences, LineLine, PointPoint, refine
+        >>> truth = jl.poses.SE2(1.0, 2.0, 0.5)
+        >>> point, wall = jnp.array([[2.0, 1.0]]), jnp.array([[1.0, 0.0]])
+        >>> turned = truth.rotation.apply(wall)
+        >>> pairs = Correspondences(PointPoint(point, truth.apply(point)), line_line=LineLine(wall, turned))
+        >>> fit = refine(pairs, jl.poses.SE2(0.0, 0.0, 0.0))
+        >>> bool(fit.ok), round(float(fit.value.theta), 3), round(float(fit.value.x), 3)
+        (True, 0.5, 1.0)
+    """
+    size = initial.translation.shape[-1]
+    for pairs in correspondences.kinds():
+        found = jax.tree.leaves(pairs)[0].shape[0]
+        if found != size:
+            raise ValueError(f"{type(pairs).__name__} holds features of {found} coordinates, the pose has {size}.")
+    return solve(Mixed(correspondences, loss), initial, solver=solver)

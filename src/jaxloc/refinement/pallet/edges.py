@@ -1,0 +1,266 @@
+"""Vertical edges of fork holes in a picture: level view, column profiles, darkening and lightening pairs, candidates.
+
+The edges of a hole are principally vertical, and come in pairs: from the left, wood darkens to the hole and lightens
+again. Columns are therefore judged by the mean of the horizontal derivative over a band of rows, taken only where the
+gradient is principally horizontal. A level camera at a known height knows in which rows the holes of a pallet at a
+given range lie, so every range has its band.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxloc.images.gradients import central_difference, smooth
+from jaxloc.images.interpolation import sample
+from jaxloc.images.normalize import as_grey
+from jaxloc.refinement.pallet.model import PalletType
+from jaxloc.sensors import GroundCamera
+
+# Part of the height of a hole that is used: its rims are blurred.
+_INNER = 0.7
+_PARTS = 4  # of an edge, measured apart to see how they scatter
+_SMOOTHING = 1.0  # of the picture before it is differentiated, px
+
+
+class LevelView(eqx.Module):
+    """A picture as a level camera without a lens would take it: columns tell bearings, rows elevations.
+
+    Attributes:
+        image: grey levels, smoothed by `smoothing`.
+        slope: horizontal derivative, zero where the gradient is not principally horizontal.
+        focal: px.
+        middle: (column, row) of the horizontal ray straight ahead, px.
+        height: of the camera over the ground, m.
+    """
+
+    image: Float[Array, "h w"]
+    slope: Float[Array, "h w"]
+    focal: Float[Array, ""]
+    middle: Float[Array, "2"]
+    height: Float[Array, ""]
+
+    def rows(self, level: Float[Array, "*n"], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Rows of points at a level above the ground (m) at a distance ahead (m)."""
+        return self.middle[1] + self.focal * (self.height - level) / x
+
+
+class Peaks(eqx.Module):
+    """The strongest edges of one polarity in a profile.
+
+    Attributes:
+        columns: to a fraction of a pixel.
+        strength: grey levels a pixel, zero in empty slots.
+    """
+
+    columns: Float[Array, " k"]
+    strength: Float[Array, " k"]
+
+
+class Candidate(eqx.Module):
+    """Four edges that may be those of a pallet.
+
+    Attributes:
+        columns: left to right, px.
+        strength: of the weakest, grey levels a pixel; zero where there is none.
+    """
+
+    columns: Float[Array, "4"]
+    strength: Float[Array, ""]
+
+
+class MeasuredEdges(eqx.Module):
+    """Four edges, each measured in its own rows.
+
+    Attributes:
+        columns: left to right, px.
+        strength: of the weakest, grey levels a pixel.
+        sigma: standard deviation of a column, px, as parts of the edges scatter.
+    """
+
+    columns: Float[Array, "4"]
+    strength: Float[Array, ""]
+    sigma: Float[Array, ""]
+
+
+@eqx.filter_jit
+def level_view(image: Any, camera: GroundCamera) -> LevelView:
+    """What a level camera without a lens would see from the same place.
+
+    Args:
+        image: grey picture, bytes too.
+        camera: that took it, with lens, height, pitch and roll.
+
+    Returns:
+        A view of the same size, whose rows are turned so far that the middle of the picture stays where it was.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> camera = jl.sensors.GroundCamera(jl.sensors.Pinhole(60.0, 60.0, 31.5, 23.5), 0.5)
+        >>> view = level_view(jnp.ones((48, 64)), camera)
+        >>> view.image.shape, bool(jnp.all(view.slope == 0))
+        ((48, 64), True)
+    """
+    grey = as_grey(image, camera.camera.fx.dtype)
+    grey = jnp.where(jnp.isfinite(grey), grey, 0.0)
+    rows, columns = grey.shape
+    focal = camera.camera.fx
+    middle = jnp.stack([camera.camera.cx, camera.camera.cy - focal * jnp.tan(camera.pitch)])
+    u, v = (jnp.arange(size, dtype=grey.dtype) for size in (columns, rows))
+    left = jnp.broadcast_to(-(u - middle[0])[None, :] / focal, grey.shape)
+    up = jnp.broadcast_to(-(v - middle[1])[:, None] / focal, grey.shape)
+    axes = camera.axes()
+    x, y, z = (axes[0, i] + axes[1, i] * left + axes[2, i] * up for i in range(3))
+    places = jnp.stack([c.reshape(-1) for c in camera.camera.project_components(x, y, z)], axis=1)
+    level = sample(grey, places)
+    seen = level.inside.reshape(grey.shape)
+    smoothed = smooth(level.values.reshape(grey.shape), _SMOOTHING)
+    return LevelView(smoothed, _principal(smoothed, seen), focal, middle, camera.height)
+
+
+def _principal(image: Float[Array, "h w"], seen: Bool[Array, "h w"]) -> Float[Array, "h w"]:
+    """Horizontal derivative where it is the principal one, zero beside the picture."""
+    slope = central_difference(image)
+    whole = smooth(jnp.where(seen, 1.0, 0.0).astype(image.dtype), 1.0) > 0.999
+    return jnp.where(whole & (jnp.abs(slope.right) >= jnp.abs(slope.down)), slope.right, 0.0)
+
+
+def summed(slope: Float[Array, "h w"]) -> Float[Array, "h1 w"]:
+    """Sums of the rows above each row: the mean over any band is then two look-ups."""
+    return jnp.concatenate([jnp.zeros_like(slope[:1]), jnp.cumsum(slope, axis=0)])
+
+
+def band_profile(sums: Float[Array, "h1 w"], top: Float[Array, ""], bottom: Float[Array, ""]) -> Float[Array, " w"]:
+    """Mean of each column between two rows, parts of rows included; zero for bands that are not in the picture."""
+    high, low = (jnp.clip(row + 0.5, 0.0, sums.shape[0] - 1.0) for row in (top, bottom))
+    inside = (low - high) > 0.5 * (bottom - top)
+
+    def upto(row: Float[Array, ""]) -> Float[Array, " w"]:
+        base = jnp.clip(jnp.floor(row).astype(int), 0, sums.shape[0] - 2)
+        part = row - base.astype(row.dtype)
+        pair = lax.dynamic_slice_in_dim(sums, base, 2)
+        return (1.0 - part) * pair[0] + part * pair[1]
+
+    length = jnp.where(inside, low - high, 1.0)
+    return jnp.where(inside, (upto(low) - upto(high)) / length, 0.0)
+
+
+def hole_band(view: LevelView, kind: PalletType, x: Float[Array, ""]) -> Float[Array, "2"]:
+    """First and last row of the inner part of the holes of a pallet at a distance ahead."""
+    middle = kind.hole_bottom + 0.5 * kind.hole_height
+    half = 0.5 * _INNER * kind.hole_height
+    return jnp.stack([view.rows(middle + half, x), view.rows(middle - half, x)])
+
+
+def strongest(profile: Float[Array, " w"], count: int) -> Peaks:
+    """The highest peaks of a profile, their places by the parabola through the logarithms of three columns.
+
+    The derivative of a blurred step is a Gaussian, whose logarithm is a parabola: the place has no bias. Places carry
+    derivatives by the profile; which columns are peaks does not change.
+    """
+    height = jnp.pad(profile, 1)
+    middle = height[1:-1]
+    peak = (middle > 0) & (middle >= height[:-2]) & (middle > height[2:])
+    ranked = lax.stop_gradient(jnp.where(peak, middle, 0.0))
+    strength, index = lax.top_k(ranked, count)
+    found = strength > 0
+    return Peaks(jnp.where(found, _vertex(height, index), 0.0), jnp.where(found, strength, 0.0))
+
+
+def peak_near(profile: Float[Array, " w"], column: Float[Array, ""], radius: int) -> Peaks:
+    """The highest place of a profile within some pixels of a column, as a set of one."""
+    width = profile.shape[0]
+    places = jnp.arange(width, dtype=profile.dtype)
+    near = jnp.abs(places - lax.stop_gradient(column)) <= radius
+    index = jnp.argmax(lax.stop_gradient(jnp.where(near, profile, -jnp.inf)))
+    height = jnp.pad(profile, 1)
+    top, sides = height[index + 1], jnp.maximum(height[index], height[index + 2])
+    found = (top > 0) & (top >= sides)
+    return Peaks(
+        jnp.where(found, _vertex(height, index[None]), column[None]),
+        jnp.where(found, lax.stop_gradient(top), 0.0)[None],
+    )
+
+
+def _vertex(height: Float[Array, " w2"], index: Int[Array, " k"]) -> Float[Array, " k"]:
+    """Column of the vertex of the parabola through three logarithms about an index of the unpadded profile."""
+    values = [height[index + shift] for shift in range(3)]
+    floor = jnp.maximum(1e-3 * values[1], float(jnp.finfo(height.dtype).tiny))
+    left, middle, right = (jnp.log(jnp.maximum(value, floor)) for value in values)
+    bend = left - 2.0 * middle + right
+    curved = bend < -1e-6
+    shift = jnp.where(curved, 0.5 * (left - right) / jnp.where(curved, bend, 1.0), 0.0)
+    return index.astype(height.dtype) + jnp.clip(shift, -1.0, 1.0)
+
+
+def best_candidate(profile: Float[Array, " w"], kind: PalletType, span: Float[Array, ""], count: int) -> Candidate:
+    """The four edges with the strongest weakest one that fit a kind of pallet seen over some columns [K-74].
+
+    Darkening, lightening, darkening, lightening from the left; ``hole width : separation`` as the kind has it, which no
+    range changes; both holes of nearly one width; and a span that a pallet turned by up to 45 degrees may have.
+
+    Args:
+        profile: mean horizontal derivative of the columns, grey levels a pixel.
+        kind: of pallet.
+        span: columns between the outer edges of a pallet that faces the camera, px.
+        count: edges of each polarity that are tried; static.
+
+    Returns:
+        The candidate.
+    """
+    dark, light = strongest(-profile, count), strongest(profile, count)
+    a, b = dark.columns[:, None, None, None], light.columns[None, :, None, None]
+    c, d = dark.columns[None, None, :, None], light.columns[None, None, None, :]
+    left, gap, right = b - a, c - b, d - c
+    ordered = (left > 1.0) & (gap > 1.0) & (right > 1.0)
+    left, gap, right = (jnp.where(ordered, part, 1.0) for part in (left, gap, right))
+    ratio = 0.5 * (left + right) / gap
+    seen = (d - a) / span
+    fits = ordered & (jnp.abs(jnp.log(ratio / kind.ratio())) < 0.15) & (jnp.abs(jnp.log(left / right)) < 0.5)
+    fits = fits & (seen > 0.6) & (seen < 1.2)
+    weakest = jnp.minimum(
+        jnp.minimum(dark.strength[:, None, None, None], light.strength[None, :, None, None]),
+        jnp.minimum(dark.strength[None, None, :, None], light.strength[None, None, None, :]),
+    )
+    score = jnp.where(fits, weakest, 0.0).reshape(-1)
+    index = jnp.unravel_index(jnp.argmax(score), (count,) * 4)
+    columns = [peaks.columns[i] for peaks, i in zip((dark, light, dark, light), index, strict=True)]
+    return Candidate(jnp.stack(columns), jnp.max(score))
+
+
+def edges_along(
+    view: LevelView, sums: Float[Array, "h1 w"], kind: PalletType, columns: Float[Array, "4"], x: Float[Array, "4"]
+) -> MeasuredEdges:
+    """Four edges measured anew, each in the rows where its own distance puts the hole.
+
+    Args:
+        view: the picture.
+        sums: of its `slope`, by `summed`.
+        kind: of pallet.
+        columns: where the edges are expected, px.
+        x: how far ahead each edge is, m.
+
+    Returns:
+        The edges.
+    """
+    signs = jnp.array([-1.0, 1.0, -1.0, 1.0], sums.dtype)
+    parts = jnp.arange(_PARTS + 1, dtype=sums.dtype) / _PARTS
+
+    def one(column: Array, distance: Array, sign: Array) -> tuple[Peaks, Array]:
+        # Whole rows: which rows are read is no part of the derivatives.
+        band = jnp.round(lax.stop_gradient(hole_band(view, kind, distance)))
+
+        def within(top: Array, bottom: Array) -> Peaks:
+            return peak_near(sign * band_profile(sums, top, bottom), column, 4)
+
+        rims = band[0] + (band[1] - band[0]) * parts
+        return within(band[0], band[1]), jax.vmap(within)(rims[:-1], rims[1:]).columns[:, 0]
+
+    whole, quarters = jax.vmap(one)(columns, x, signs)
+    quarters = lax.stop_gradient(quarters)
+    # Four edges pool their scatter: one edge alone has three numbers to tell it by.
+    scatter = jnp.sum((quarters - jnp.mean(quarters, axis=1, keepdims=True)) ** 2) / (4 * (_PARTS - 1))
+    return MeasuredEdges(whole.columns[:, 0], jnp.min(whole.strength), jnp.sqrt(scatter / _PARTS))

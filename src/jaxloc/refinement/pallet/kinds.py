@@ -1,0 +1,114 @@
+"""Which kind of pallet a face is: the correlation with a picture of each kind's front, drawn by its measures [K-75]."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxloc.images.interpolation import sample
+from jaxloc.images.normalize import standardize
+from jaxloc.poses import SE2
+from jaxloc.refinement.pallet.edges import LevelView
+from jaxloc.refinement.pallet.model import PalletType
+
+_ROWS, _COLUMNS = 24, 128
+_MARGIN = 1.08  # width of the template over that of the face: what is beside the face counts too
+
+
+@eqx.filter_jit
+def face_template(kind: PalletType) -> Float[Array, "24 128"]:
+    """The front of a pallet: one where there is wood, zero in the holes and beside the face.
+
+    Example:
+        >>> from jaxloc.refinement.pallet import euro_long, face_template
+        >>> face_template(euro_long()).shape
+        (24, 128)
+    """
+    along, level = _grid(kind)
+    edges, half = kind.edges(), 0.5 * kind.face_width
+    in_hole = ((along < edges[0]) & (along > edges[1])) | ((along < edges[2]) & (along > edges[3]))
+    open_rows = (level > kind.hole_bottom) & (level < kind.hole_bottom + kind.hole_height)
+    wood = (jnp.abs(along) < half)[None, :] & ~(in_hole[None, :] & open_rows[:, None])
+    return jnp.where(wood, 1.0, 0.0).astype(kind.hole_width.dtype)
+
+
+@eqx.filter_jit
+def view_face(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, "24 128"]:
+    """What the picture shows where the face of a pallet would be, sampled along the face.
+
+    Args:
+        view: the picture.
+        kind: whose measures to take.
+        pose: ``T_ground_pallet``.
+
+    Returns:
+        Grey levels, nan where the face is not in the picture.
+    """
+    along, level = _grid(kind)
+    rotation = pose.rotation.matrix()
+    x, y = (rotation[i, 1] * along + pose.translation[i] for i in range(2))
+    ahead = x > 0.05
+    x, y = jnp.where(ahead, x, 1.0), jnp.where(ahead, y, 0.0)
+    u = jnp.broadcast_to((view.middle[0] - view.focal * y / x)[None, :], (_ROWS, _COLUMNS))
+    v = view.rows(*(jnp.broadcast_to(c, u.shape) for c in (level[:, None], x[None, :])))
+    read = sample(view.image, jnp.stack([u.reshape(-1), v.reshape(-1)], axis=1))
+    shown = (read.inside & jnp.broadcast_to(ahead[None, :], u.shape).reshape(-1)).reshape(u.shape)
+    return jnp.where(shown, read.values.reshape(u.shape), jnp.nan)
+
+
+@eqx.filter_jit
+def type_correlation(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, ""]:
+    """Normalized correlation of the picture at a pose with the front of a kind: one for what is drawn by its measures.
+
+    Args:
+        view: the picture.
+        kind: of pallet.
+        pose: ``T_ground_pallet``.
+
+    Returns:
+        In [-1, 1]; zero where less than four fifths of the face is in the picture.
+
+    References:
+        KELLY 9.2.4.2.2, templates correlated to identify the type [K-75].
+    """
+    face = view_face(view, kind, pose)
+    shown = jnp.isfinite(face)
+    template = face_template(kind).astype(face.dtype)
+    count = jnp.maximum(jnp.sum(shown), 1).astype(face.dtype)
+    a = standardize(jnp.where(shown, face, 0.0), valid=shown)
+    b = standardize(template, valid=shown)
+    return jnp.where(jnp.mean(shown.astype(face.dtype)) > 0.8, jnp.sum(a * b) / count, 0.0)
+
+
+@eqx.filter_jit
+def correlate_types(view: LevelView, kinds: PalletType, pose: SE2) -> Float[Array, " m"]:
+    """`type_correlation` with each kind of a bank at one pose.
+
+    Args:
+        view: the picture.
+        kinds: a stack, as `stack_types` makes it.
+        pose: ``T_ground_pallet``.
+
+    Returns:
+        One correlation a kind.
+    """
+    return jax.vmap(lambda kind: type_correlation(view, kind, pose))(kinds)
+
+
+def stack_types(kinds: tuple[PalletType, ...]) -> PalletType:
+    """Kinds of pallets as one record with a leading axis.
+
+    Raises:
+        ValueError: there are none.
+    """
+    if not kinds:
+        raise ValueError("No pallet types: give a tuple with at least one.")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *kinds)
+
+
+def _grid(kind: PalletType) -> tuple[Float[Array, "128"], Float[Array, "24"]]:
+    """Places along the face, from left to right, and levels, from above."""
+    dtype = kind.hole_width.dtype
+    right = (jnp.arange(_COLUMNS, dtype=dtype) + 0.5) / _COLUMNS
+    down = (jnp.arange(_ROWS, dtype=dtype) + 0.5) / _ROWS
+    return _MARGIN * kind.face_width * (0.5 - right), kind.face_height * (1.0 - down)
