@@ -80,7 +80,9 @@ def direct_linear_transform(
     one, zero = valid.astype(u.dtype), jnp.zeros_like(u)
     rows_u = jnp.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
     rows_v = jnp.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)
-    _, _, right = jnp.linalg.svd(jnp.concatenate([rows_u, rows_v]), full_matrices=True)
+    # Four points give eight rows: a ninth of zeros keeps the null vector in a thin decomposition.
+    rows = jnp.concatenate([rows_u, rows_v, jnp.zeros_like(rows_u[:1])])
+    _, _, right = jnp.linalg.svd(rows, full_matrices=False)
     matrix = matmul(_denormalizer(to_pixels), matmul(right[8].reshape(3, 3), to_points))
     norm = jnp.sqrt(jnp.sum(matrix * matrix))
     good = jnp.isfinite(norm) & (norm > 0)
@@ -196,7 +198,8 @@ def transfer_error(
     valid: Bool[Array, " n"],
 ) -> Float[Array, "2 n"]:
     """What `TransferError` whitens, of any matrix: 1000 sigmas behind the horizon, zero where masked."""
-    x, y, w = matmul(matrix[:, :2], first) + matrix[:, 2:]
+    # Written out, so that many hypotheses become one loop over the points.
+    x, y, w = (row[0] * first[0] + row[1] * first[1] + row[2] for row in matrix)
     # The sign of the determinant is one: points of the plane that both cameras see have positive w.
     ahead = valid & (w > float(jnp.finfo(w.dtype).eps))
     inverse = 1.0 / jnp.where(ahead, w, 1.0)
