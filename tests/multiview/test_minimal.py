@@ -38,9 +38,9 @@ def test_finds_the_true_pose(dtype, batch):
     best = errors_of(found, R, t).min(1)
     assert found.poses.translation.dtype == dtype
     if dtype == np.float64:
-        assert (best < 1e-6).mean() >= 0.999
-    else:
-        assert (best < 1e-3).mean() >= 0.98
+        assert (best < 1e-6).all()
+    else:  # Some are lost when the input is rounded, more when the equations are.
+        assert (best < 1e-3).mean() >= 0.997
 
 
 def test_narrow_field_of_view(x64, batch):
