@@ -20,6 +20,10 @@ from jaxloc.solvers.ransac import sample_indices
 # 99 % of the absolute value of a normal variable.
 _GATE = 2.58
 _SAMPLE = 5
+# Pairs in a subset that local optimization refits.
+_SUBSET = 10
+# Greatest probability that no sample was free of wrong pairs.
+_DOUBT = 0.05
 # Sigmas at which the search for a rotation begins to doubt a pair.
 _FAR = 200.0
 
@@ -31,15 +35,19 @@ class Consensus(eqx.Module):
         hypotheses: samples of five points; each gives up to ten essential matrices.
         pretest: correspondences, drawn at random, on which all of them are scored.
         finalists: the best, scored on all correspondences.
-        refined: the best of these, refined on the manifold before the last vote.
+        refined: the best of these, refined on the manifold before they are voted on again.
         steps: of the refinement.
+        rounds: of local optimization of the winner.
+        subsets: of its inliers, tried in a round.
     """
 
     hypotheses: int = eqx.field(static=True, default=128)
     pretest: int = eqx.field(static=True, default=128)
     finalists: int = eqx.field(static=True, default=16)
-    refined: int = eqx.field(static=True, default=4)
+    refined: int = eqx.field(static=True, default=2)
     steps: int = eqx.field(static=True, default=6)
+    rounds: int = eqx.field(static=True, default=2)
+    subsets: int = eqx.field(static=True, default=16)
 
 
 class _Pairs(NamedTuple):
@@ -71,9 +79,10 @@ def estimate_relative_pose(
 ) -> Estimate:
     """Rotation and direction of translation between two calibrated views, with covariance.
 
-    Five-point samples vote by truncated squared Sampson distances (MSAC); the best are refined on the manifold of
-    essential matrices by reweighted Gauss-Newton steps, vote once more, and the winner is the start of a robust
-    minimum over all correspondences. The derivatives are that minimum's.
+    All pairs vote on five-point samples by truncated squared Sampson distances (MSAC). The best are refined on the
+    manifold of essential matrices by reweighted Gauss-Newton steps, the winner is improved by refits to subsets of its
+    inliers (local optimization), and is the start of a robust minimum over all correspondences. The derivatives are
+    that minimum's.
 
     Args:
         first: normalized points of the first view (`Pinhole.normalize`), without unit.
@@ -86,14 +95,15 @@ def estimate_relative_pose(
 
     Returns:
         Estimate of the `RelativePose` ``T_first_second``; its tangent is (direction, rotation), five numbers. ``ok`` is
-        False when too few points agree, and when a rotation alone explains them: without parallax there is no
-        direction. A plane is enough, though two poses may explain it.
+        False when too few points agree, when with so few of them a sample without a wrong one was not to be expected
+        (95 %: raise `hypotheses`), and when a rotation alone explains them: without parallax there is no direction. A
+        plane is enough, though two poses may explain it.
 
     Raises:
         ValueError: fewer than five correspondences.
 
     References:
-        Nister 2004; Chum, Matas, Kittler, "Locally optimized RANSAC", DAGM 2003 [K-60]; Torr and Zisserman 2000;
+        Nister 2004; Chum, Matas, Kittler, "Locally optimized RANSAC", DAGM 2003 [K-60, K-61]; Torr and Zisserman 2000;
         monocular scale is free [K-88].
 
     Example:
@@ -117,7 +127,7 @@ def estimate_relative_pose(
     loss = Tukey(jnp.asarray(4.685, first.dtype)) if loss is None else loss
     problem = EpipolarError(pairs.first, pairs.second, pairs.sigma, pairs.valid, loss)
     fit = solve(problem, start, solver=LevenbergMarquardt())
-    return _judged(fit, still, inliers)
+    return _judged(fit, still, inliers, consensus.hypotheses)
 
 
 def _safe(first: Array, second: Array, sigma: Any, valid: Bool[Array, " n"] | None) -> _Pairs:
@@ -129,7 +139,7 @@ def _safe(first: Array, second: Array, sigma: Any, valid: Bool[Array, " n"] | No
 
 def _winner(pairs: _Pairs, key: Key[Array, ""], options: Consensus) -> tuple[RelativePose, Bool[Array, " n"]]:
     """The pose with the best vote, and those who voted for it."""
-    draw, order = jax.random.split(key)
+    draw, order, inner = jax.random.split(key, 3)
     chosen = sample_indices(draw, pairs.valid, _SAMPLE, options.hypotheses)
     rays = [points.T / jnp.sqrt(jnp.sum(points**2, axis=0))[:, None] for points in (pairs.first, pairs.second)]
     essentials, usable = essential_candidates(rays[0][chosen], rays[1][chosen])
@@ -137,11 +147,44 @@ def _winner(pairs: _Pairs, key: Key[Array, ""], options: Consensus) -> tuple[Rel
     essentials = _best(essentials, usable.reshape(-1), _drawn(pairs, order, options.pretest), options.finalists)
     essentials = _best(essentials, jnp.ones(len(essentials), bool), pairs, options.refined)
     poses = jax.vmap(lambda essential: _refined(decompose(essential), pairs, options.steps))(essentials)
-    costs = _votes(jax.vmap(lambda pose: pose.essential())(poses), pairs)
-    best = jnp.argmin(costs)
-    pose = jax.tree.map(lambda leaf: leaf[best], poses)
+    pose = _elected(poses, pairs, 1)
+    rounds = jax.random.split(inner, options.rounds)
+    pose, _ = lax.scan(lambda pose, key: (_improved(pose, pairs, key, options.subsets), None), pose, rounds)
+    pose = jax.tree.map(lambda leaf: leaf[0], pose)
     inliers = _inliers(pose, pairs)
-    return facing(pose, pairs.first.T, pairs.second.T, inliers.astype(costs.dtype)), inliers
+    return facing(pose, pairs.first.T, pairs.second.T, inliers.astype(pairs.sigma.dtype)), inliers
+
+
+def _improved(pose: RelativePose, pairs: _Pairs, key: Key[Array, ""], count: int) -> RelativePose:
+    """Local optimization: subsets of the inliers refine the pose each in its own way, and all vote again.
+
+    A wrong pair among the inliers holds a pose in a local minimum of the vote, or of any robust kernel; most small
+    subsets are free of it.
+
+    Args:
+        pose: a stack of one.
+        pairs: all correspondences.
+        key: random key.
+        count: of subsets.
+    """
+    best = jax.tree.map(lambda leaf: leaf[0], pose)
+    chosen = sample_indices(key, _inliers(best, pairs), _SUBSET, count)
+
+    def refit(index: Int[Array, " m"]) -> RelativePose:
+        some = _Pairs(pairs.first[:, index], pairs.second[:, index], pairs.sigma, pairs.valid[index])
+        return _refined(best, some, 3)
+
+    poses = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), pose, jax.vmap(refit)(chosen))
+    poses = _elected(poses, pairs, 2)
+    refined = jax.vmap(lambda pose: _refined(pose, pairs, 3))(poses)
+    return _elected(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), poses, refined), pairs, 1)
+
+
+def _elected(poses: RelativePose, pairs: _Pairs, count: int) -> RelativePose:
+    """Some of the poses: those with the best votes."""
+    costs = _votes(jax.vmap(lambda pose: pose.essential())(poses), pairs)
+    _, index = lax.top_k(-costs, count)
+    return jax.tree.map(lambda leaf: leaf[index], poses)
 
 
 def _drawn(pairs: _Pairs, key: Key[Array, ""], count: int) -> _Pairs:
@@ -195,8 +238,8 @@ def _inliers(pose: RelativePose, pairs: _Pairs) -> Bool[Array, " n"]:
     return pairs.valid & (jnp.abs(error) < _GATE * pairs.sigma)
 
 
-def _judged(fit: Estimate, pairs: _Pairs, before: Bool[Array, " n"]) -> Estimate:
-    """Believed if more points agree than by chance, and a rotation alone does not explain them."""
+def _judged(fit: Estimate, pairs: _Pairs, before: Bool[Array, " n"], hypotheses: int) -> Estimate:
+    """Believed if more points agree than by chance, enough was tried, and a rotation alone does not explain them."""
     pose = lax.stop_gradient(fit.value)
     inliers = _inliers(pose, pairs)
     count, number = (jnp.sum(mask).astype(pairs.sigma.dtype) for mask in (inliers, pairs.valid))
@@ -210,7 +253,10 @@ def _judged(fit: Estimate, pairs: _Pairs, before: Bool[Array, " n"]) -> Estimate
     apart = jnp.sum(inliers & _unturned(pairs, inliers)).astype(count.dtype)
     moved = apart > 2.0 * _SAMPLE + (6.0 * jnp.minimum(chance, 1.0) + 0.02) * number
     faces = _ahead(pose, pairs, inliers) > 0.5 * count
-    ok = fit.ok & enough & (jnp.sum(before) > _SAMPLE)
+    # With so few of them right, would so many samples have held one without a wrong pair?
+    share = jnp.clip(count / jnp.maximum(number, 1.0) - chance, 0.0, 1.0)
+    searched = (1.0 - share**_SAMPLE) ** hypotheses < _DOUBT
+    ok = fit.ok & enough & searched & (jnp.sum(before) > _SAMPLE)
     status = jnp.where(moved & faces, fit.status, int(Status.RANK_DEFICIENT))
     status = jnp.where(ok | ~fit.ok, status, int(Status.INADMISSIBLE))
     ok = ok & moved & faces
