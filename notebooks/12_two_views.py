@@ -26,7 +26,7 @@ from jaxloc.multiview.epipolar import epipolar_gate, epipolar_lines, fundamental
 from jaxloc.multiview.rectification import rectifying_homographies
 
 FAST = "JAXLOC_FAST" in os.environ
-plt.rcParams["figure.dpi"] = 60
+plt.rcParams["figure.dpi"] = 50
 np.set_printoptions(precision=3, suppress=True)
 
 # %% [markdown]
