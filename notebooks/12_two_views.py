@@ -21,7 +21,7 @@ from jaxloc.images import detect
 from jaxloc.images.describe import describe
 from jaxloc.images.detectors import SIFT
 from jaxloc.images.match import match
-from jaxloc.multiview import Consensus, RelativePose, disparity, estimate_relative_pose, intersect
+from jaxloc.multiview import ConsensusOptions, RelativePose, disparity, estimate_relative_pose, intersect
 from jaxloc.multiview.epipolar import epipolar_gate, epipolar_lines, fundamental, sampson_distance
 from jaxloc.multiview.rectification import rectifying_homographies
 
@@ -56,7 +56,9 @@ def pictures(key, false, pose=truth):
 def solve(first, second, keys, hypotheses=128):
     def one(first, second, key):
         rays = camera.normalize(first), camera.normalize(second)
-        return estimate_relative_pose(*rays, sigma=sigma / focal, key=key, consensus=Consensus(hypotheses=hypotheses))
+        return estimate_relative_pose(
+            *rays, sigma=sigma / focal, key=key, consensus=ConsensusOptions(hypotheses=hypotheses)
+        )
 
     return jax.vmap(one)(first, second, keys)
 

@@ -8,13 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxloc.multiview.epipolar import RelativePose
-from jaxloc.multiview.two_view import Consensus, estimate_relative_pose
+from jaxloc.multiview.two_view import ConsensusOptions, estimate_relative_pose
 from jaxloc.poses import SE3, SO3, Direction
 from jaxloc.solvers import Quadratic
 
 FOCAL, SIZE, SIGMA, COUNT = 700.0, np.array([1240.0, 376.0]), 0.5, 200
 # Compiled once for each dtype: what tests share.
-LIGHT = Consensus(hypotheses=64, pretest=64, finalists=8, refined=2)
+LIGHT = ConsensusOptions(hypotheses=64, pretest=64, finalists=8, refined=2)
 
 
 @jax.jit
@@ -73,7 +73,7 @@ def test_consistency(x64):
     """Under least squares, from the true pose: five degrees of freedom."""
     first, second, R, t = pairs(3, false=0.0, sigma=0.0)
     true = RelativePose(Direction(jnp.asarray(t)), SO3(jnp.asarray(R)))
-    light = Consensus(hypotheses=32, pretest=64, finalists=4, refined=1)
+    light = ConsensusOptions(hypotheses=32, pretest=64, finalists=4, refined=1)
 
     @jax.jit
     def squared(key):
@@ -125,7 +125,7 @@ def degenerate(kind, seed):
 
 @pytest.mark.parametrize("kind", ["planar", "rotation", "repeated", "collinear", "noise", "nan", "empty"])
 def test_degenerate_sets(kind):
-    """A thousand sets in all, here and in the benchmark ten times as many: finite in value and derivative."""
+    """Finite in value and derivative; the benchmark tries ten thousand sets."""
     sets = [degenerate(kind, seed) for seed in range(20)]
     first, second = (jnp.asarray(np.stack(p), jnp.float32) for p in zip(*sets, strict=True))
     valid = jnp.ones((20, COUNT), bool) & (kind != "empty")

@@ -19,10 +19,10 @@ from jaxloc.multiview.homography import estimate_homography
 from jaxloc.multiview.intersection import intersect
 from jaxloc.multiview.minimal import MinimalPoses, p3p
 from jaxloc.multiview.triangulation import Linear, Sampled, TriangulationMethod, Unscented, coverage, stereo
-from jaxloc.multiview.two_view import Consensus, estimate_relative_pose
+from jaxloc.multiview.two_view import ConsensusOptions, estimate_relative_pose
 
 __all__ = [
-    "Consensus",
+    "ConsensusOptions",
     "Linear",
     "MinimalPoses",
     "RelativePose",

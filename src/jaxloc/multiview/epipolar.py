@@ -118,6 +118,27 @@ def null_vector(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return vector / jnp.sqrt(jnp.where(known, squares[best], 1.0))
 
 
+def unit_rays(rays: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Rays of length one; zero where numbers are not finite."""
+    rays = jnp.where(jnp.all(jnp.isfinite(rays), axis=1, keepdims=True), rays, 0.0)
+    squared = jnp.sum(rays * rays, axis=1, keepdims=True)
+    return rays / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+
+
+def depth_signs(
+    direction: Float[Array, "3"], first: Float[Array, "n 3"], turned: Float[Array, "n 3"]
+) -> Float[Array, "2 n"]:
+    """Whose sign tells whether the point where two rays come nearest lies ahead (+) along each of them.
+
+    Args:
+        direction: of the translation, frame of the first camera.
+        first: rays of the first camera, of any length.
+        turned: rays of the second, in the frame of the first.
+    """
+    normal, shift = jnp.cross(first, turned), jnp.broadcast_to(direction, first.shape)
+    return jnp.stack([jnp.sum(jnp.cross(shift, other) * normal, axis=1) for other in (turned, first)])
+
+
 def coplanarity(
     matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "n 2"]
 ) -> Float[Array, " n"]:

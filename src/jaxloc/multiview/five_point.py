@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxloc.multiview.epipolar import RelativePose, null_vector
+from jaxloc.multiview.epipolar import RelativePose, depth_signs, null_vector, unit_rays
 from jaxloc.poses import SO3, Direction, retract
 from jaxloc.poses.group import matmul, skew
 from jaxloc.solvers.linear import factor
@@ -81,7 +81,7 @@ def five_point(first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> Relat
         >>> bool((found.valid & (error < 1e-3)).any())
         True
     """
-    first, second = (_units(rays) for rays in lax.stop_gradient((first, second)))
+    first, second = (unit_rays(rays) for rays in lax.stop_gradient((first, second)))
     essentials, real = essential_candidates(first[None], second[None])
 
     def candidate(essential: Array, real: Array) -> tuple[RelativePose, Array]:
@@ -116,12 +116,6 @@ def essential_candidates(
     weights = (x / scale, y / scale, roots, jnp.ones_like(roots))
     essentials = sum(jnp.where(good, c, 0.0)[:, :, None, None] * basis[None, :, k] for k, c in enumerate(weights))
     return essentials, real & good & (spans & regular)[None, :]
-
-
-def _units(rays: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    rays = jnp.where(jnp.all(jnp.isfinite(rays), axis=1, keepdims=True), rays, 0.0)
-    squared = jnp.sum(rays * rays, axis=1, keepdims=True)
-    return rays / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
 
 
 def _null_space(first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> tuple[Float[Array, "4 3 3"], Array]:
@@ -309,11 +303,8 @@ def facing(
 
     def votes(turn: Array) -> Float[Array, "2"]:
         turned = matmul(second, turn.T)
-        normal = jnp.cross(first, turned)
-        shift = jnp.broadcast_to(t, first.shape)
-        ahead1 = jnp.sum(jnp.cross(shift, turned) * normal, axis=1)
-        ahead2 = jnp.sum(jnp.cross(shift, first) * normal, axis=1)
-        both = (ahead1 > 0) & (ahead2 > 0), (ahead1 < 0) & (ahead2 < 0)
+        signs = depth_signs(t, first, turned)
+        both = jnp.all(signs > 0, axis=0), jnp.all(signs < 0, axis=0)
         return jnp.stack([jnp.sum(jnp.where(good, weight, 0.0)) for good in both])
 
     best = jnp.argmax(jax.vmap(votes)(turns).reshape(-1))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc.multiview.epipolar import depth_signs, unit_rays
 from jaxloc.multiview.minimal import MinimalPoses
 from jaxloc.poses import SE3, SO3
 
@@ -43,7 +44,7 @@ def planar_relative(first: Float[Array, "2 3"], second: Float[Array, "2 3"]) -> 
         >>> bool((found.valid & (error < 1e-3)).any())
         True
     """
-    first, second = (_units(rays) for rays in (first, second))
+    first, second = (unit_rays(rays) for rays in (first, second))
     left, right = _sides(first, second)
     still = lax.stop_gradient((left, right))
     headings, good = _closed_form(*still)
@@ -67,12 +68,6 @@ def planar_relative(first: Float[Array, "2 3"], second: Float[Array, "2 3"]) -> 
     turned = jnp.abs(lax.stop_gradient(poses.rotation.rotation_matrix[0] - poses.rotation.rotation_matrix[1]))
     other = jnp.maximum(apart, jnp.max(turned)) > 10.0 * float(jnp.finfo(apart.dtype).eps) ** 0.5
     return MinimalPoses(poses, valid & jnp.stack([jnp.array(True), other | ~valid[0]]))
-
-
-def _units(rays: Float[Array, "2 3"]) -> Float[Array, "2 3"]:
-    rays = jnp.where(jnp.all(jnp.isfinite(rays), axis=1, keepdims=True), rays, 0.0)
-    squared = jnp.sum(rays * rays, axis=1, keepdims=True)
-    return rays / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
 
 
 def _sides(first: Array, second: Array) -> tuple[Float[Array, "2 2"], Float[Array, "2 2"]]:
@@ -141,7 +136,5 @@ def _ahead(first: Array, second: Array, angles: Float[Array, "2"]) -> Array:
     first, second, angles = lax.stop_gradient((first, second, angles))
     turned = jnp.sum(_about_y(angles[0] - angles[1])[None] * second[:, None, :], axis=2)
     zero = jnp.zeros_like(angles[0])
-    shift = jnp.broadcast_to(jnp.stack([jnp.sin(angles[0]), zero, jnp.cos(angles[0])]), first.shape)
-    normal = jnp.cross(first, turned)
-    sides = (jnp.sum(jnp.cross(shift, other) * normal, axis=1) > 0 for other in (turned, first))
-    return jnp.sum(jnp.logical_and(*sides))
+    heading = jnp.stack([jnp.sin(angles[0]), zero, jnp.cos(angles[0])])
+    return jnp.sum(jnp.all(depth_signs(heading, first, turned) > 0, axis=0))

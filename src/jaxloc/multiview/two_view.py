@@ -8,7 +8,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from jaxloc.multiview.epipolar import EpipolarError, RelativePose, homogeneous, sampson_components
+from jaxloc.multiview.epipolar import (
+    EpipolarError,
+    RelativePose,
+    depth_signs,
+    homogeneous,
+    sampson_components,
+    unit_rays,
+)
 from jaxloc.multiview.five_point import decompose, essential_candidates, facing
 from jaxloc.multiview.homography import transfer_error
 from jaxloc.poses import retract
@@ -28,7 +35,7 @@ _DOUBT = 0.05
 _FAR = 200.0
 
 
-class Consensus(eqx.Module):
+class ConsensusOptions(eqx.Module):
     """How correspondences vote.
 
     Attributes:
@@ -75,7 +82,7 @@ def estimate_relative_pose(
     key: Key[Array, ""],
     valid: Bool[Array, " n"] | None = None,
     loss: Loss | None = None,
-    consensus: Consensus = Consensus(),  # noqa: B008 (an immutable record)
+    consensus: ConsensusOptions = ConsensusOptions(),  # noqa: B008 (an immutable record)
 ) -> Estimate:
     """Rotation and direction of translation between two calibrated views, with covariance.
 
@@ -137,11 +144,11 @@ def _safe(first: Array, second: Array, sigma: Any, valid: Bool[Array, " n"] | No
     return _Pairs(homogeneous(first), homogeneous(second), jnp.asarray(sigma, first.dtype), counts)
 
 
-def _winner(pairs: _Pairs, key: Key[Array, ""], options: Consensus) -> tuple[RelativePose, Bool[Array, " n"]]:
+def _winner(pairs: _Pairs, key: Key[Array, ""], options: ConsensusOptions) -> tuple[RelativePose, Bool[Array, " n"]]:
     """The pose with the best vote, and those who voted for it."""
     draw, order, inner = jax.random.split(key, 3)
     chosen = sample_indices(draw, pairs.valid, _SAMPLE, options.hypotheses)
-    rays = [points.T / jnp.sqrt(jnp.sum(points**2, axis=0))[:, None] for points in (pairs.first, pairs.second)]
+    rays = [unit_rays(points.T) for points in (pairs.first, pairs.second)]
     essentials, usable = essential_candidates(rays[0][chosen], rays[1][chosen])
     essentials = essentials.reshape(-1, 3, 3)
     essentials = _best(essentials, usable.reshape(-1), _drawn(pairs, order, options.pretest), options.finalists)
@@ -267,7 +274,7 @@ def _judged(fit: Estimate, pairs: _Pairs, before: Bool[Array, " n"], hypotheses:
 
 def _unturned(pairs: _Pairs, inliers: Bool[Array, " n"]) -> Bool[Array, " n"]:
     """Which pairs the best rotation, found by reweighting, leaves further apart than noise does (99 %)."""
-    rays = [(points / jnp.sqrt(jnp.sum(points**2, axis=0))[None]).T for points in (pairs.first, pairs.second)]
+    rays = [unit_rays(points.T) for points in (pairs.first, pairs.second)]
 
     def left(rotation: Array) -> Float[Array, " n"]:
         error = transfer_error(rotation, pairs.second[:2], pairs.first[:2], pairs.sigma, inliers)
@@ -284,10 +291,6 @@ def _unturned(pairs: _Pairs, inliers: Bool[Array, " n"]) -> Bool[Array, " n"]:
 
 def _ahead(pose: RelativePose, pairs: _Pairs, inliers: Bool[Array, " n"]) -> Float[Array, ""]:
     """How many inliers lie ahead of both cameras."""
-    t = pose.direction.vector
     turned = matmul(pose.rotation.matrix(), pairs.second)
-    normal = jnp.cross(pairs.first, turned, axis=0)
-    shift = jnp.broadcast_to(t[:, None], turned.shape)
-    first = jnp.sum(jnp.cross(shift, turned, axis=0) * normal, axis=0) > 0
-    second = jnp.sum(jnp.cross(shift, pairs.first, axis=0) * normal, axis=0) > 0
-    return jnp.sum(inliers & first & second).astype(t.dtype)
+    signs = depth_signs(pose.direction.vector, pairs.first.T, turned.T)
+    return jnp.sum(inliers & jnp.all(signs > 0, axis=0)).astype(signs.dtype)

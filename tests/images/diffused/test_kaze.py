@@ -95,7 +95,7 @@ def test_descriptors_know_no_gain_and_bias(pictures):
     np.testing.assert_allclose(jnp.linalg.norm(plain.values, axis=1), 1.0, atol=1e-5)
 
 
-def test_gradients_are_finite_and_follow_the_picture(x64, pictures):
+def test_gradients_are_finite(x64, pictures):
     """Through diffusion, extrema, directions and descriptors; the contrast is held."""
     image = jnp.asarray(pictures["astronaut"][60:124, 30:94], jnp.float64)
 
