@@ -233,3 +233,50 @@ def test_pose_errors_agree_with_their_covariance(x64, rng):
     mean = float(jnp.mean(jax.jit(lambda noise: jax.lax.map(squared, noise))(noise)))
     # 6 degrees of freedom over 200 runs: a standard deviation of 0.245.
     assert 5.2 < mean < 6.8
+
+
+def test_covariance_of_a_robust_bundle_equals_the_sandwich(x64, rng):
+    """Dense, by autodiff of each observation's cost; leverage by the points alone, as documented."""
+    rig, loss = rig_at(), Cauchy(2.0)
+    _, start, measured = scene(rig, rng)
+    found = adjust(rig, start, sights(measured.at[::7].add(3.0), sigma=0.5), loss=loss)
+    first, rest = (jax.tree.map(lambda leaf, part=part: leaf[part], found.value.poses) for part in (0, slice(1, None)))
+    state, data = (rest, found.value.points), (rig, first, measured.at[::7].add(3.0))
+    zero = jnp.zeros(6 * (CAMERAS - 1) + 3 * POINTS)
+    residual = np.asarray(dense_residual(state, data)).T
+    jacobian = np.asarray(jax.jacfwd(lambda d: dense_residual(retract(state, d), data))(zero)).transpose(1, 0, 2)
+    squared = np.sum(residual**2, axis=1)
+    weight, fall = 1.0 / (1.0 + squared / 4.0), -0.25 / (1.0 + squared / 4.0) ** 2
+    fall = np.maximum(2.0 * fall, -0.9 * weight / squared)
+    score = np.einsum("mkd,mk->md", jacobian, residual)
+    hessian = np.einsum("m,mkd,mke->de", weight, jacobian, jacobian) + np.einsum("m,md,me->de", fall, score, score)
+    on_point = jacobian.reshape(*jacobian.shape[:2], -1, 3)[np.arange(len(POINT)), :, CAMERAS * 2 - 2 + POINT]
+    blocks = np.stack([hessian[i : i + 3, i : i + 3] for i in 6 * CAMERAS - 6 + 3 * POINT])
+    share = np.einsum("m,mki,mij,mkj->m", weight, on_point, np.linalg.inv(blocks), on_point) / 3.0
+    score = score * (weight / (1.0 - share))[:, None]
+    inverse = np.linalg.inv(hessian)
+    expected = inverse @ (score.T @ score) @ inverse
+    joint = np.asarray(found.pose_covariance(jnp.array([1, 3, 0]))).reshape(18, 18)
+    chosen = np.r_[0:6, 12:18]
+    np.testing.assert_allclose(joint[:12, :12], expected[np.ix_(chosen, chosen)], rtol=1e-6, atol=1e-12)
+    assert not np.any(joint[12:])
+    spread = found.point_covariance(jnp.array([9]))
+    np.testing.assert_allclose(spread[0], expected[45:48, 45:48], rtol=1e-6, atol=1e-12)
+
+
+def test_robust_pose_errors_agree_with_their_covariance(x64, rng):
+    """A tenth of the observations is ten times as wrong as the sigma says."""
+    rig = rig_at()
+    truth, _, clean = scene(rig, rng, noise=0.0)
+    structure = Structure.of(CAMERA, POINT, **TABLES)
+    scale = np.where(rng.random((200, len(CAMERA), 1)) < 0.1, 5.0, 0.5)
+    noise = jnp.asarray(scale * rng.normal(size=(200, *clean.shape)))
+
+    def squared(noise):
+        fit = adjust(rig, truth, sights(clean + noise, sigma=0.5), structure=structure, loss=Cauchy(2.0))
+        last = jax.tree.map(lambda leaf: leaf[-1], truth.poses)
+        return jnp.where(fit.ok, fit.pose_gaussian(CAMERAS - 1).mahalanobis_squared(last), jnp.nan)
+
+    values = np.asarray(jax.jit(lambda noise: jax.lax.map(squared, noise))(noise))
+    assert np.isfinite(values).sum() >= 198
+    assert 5.0 < np.nanmean(values) < 7.0

@@ -9,10 +9,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import SE3
+from jaxloc.poses.group import matmul
 from jaxloc.refinement.bundle.problem import Bundle, BundleProblem
-from jaxloc.refinement.bundle.schur import Eliminated, Tangent, eliminate, normal_equations
+from jaxloc.refinement.bundle.schur import Eliminated, Tangent, eliminate, normal_equations, score_products
 from jaxloc.refinement.bundle.structure import Structure
-from jaxloc.solvers import Estimate, Status
+from jaxloc.solvers import Estimate, Quadratic, Status
 from jaxloc.solvers.linear import factor
 
 
@@ -21,8 +22,8 @@ class BundleEstimate(eqx.Module):
 
     It is no `jaxloc.solvers.Estimate`, since the covariance of all unknowns would hold the square of three numbers a
     point: gigabytes. Covariances of the poses and points that are asked for are made on demand, and `pose_estimate`
-    gives what filters and pose graphs accept. They are inverses of the Gauss-Newton Hessian (under robust kernels of
-    the weighted one), that is, they hold if sigmas are right.
+    gives what filters and pose graphs accept. Under plain least squares they are inverses of the Gauss-Newton Hessian,
+    right if the sigmas are; under robust kernels the sandwich of M-estimation, which believes the scatter that it saw.
 
     Attributes:
         value: poses and points.
@@ -55,9 +56,15 @@ class BundleEstimate(eqx.Module):
             Covariance of camera ``cameras[i]`` with ``cameras[j]`` at ``[i, :, j, :]``, m and rad. Where directions are
             undetermined it is finite and without meaning.
         """
-        inverse = self._factored().system.inverse()
-        size = self.value.poses.batch_shape[0]
-        blocks = inverse.reshape(size, 6, size, 6)[cameras][:, :, cameras]
+        eliminated, (size, count) = self._factored(), (self.value.poses.batch_shape[0], cameras.shape[0])
+        if isinstance(self.problem.loss, Quadratic):
+            blocks = eliminated.system.inverse().reshape(size, 6, size, 6)[cameras][:, :, cameras]
+        else:
+            rows = 6 * cameras[:, None] + jnp.arange(6, dtype=cameras.dtype)[None, :]
+            still, none = jnp.zeros(6 * size, self.cost.dtype), jnp.zeros_like(self.value.points)
+            unit = lambda row: Tangent(still.at[row].set(1.0).reshape(size, 6), none)  # noqa: E731
+            solved = jax.lax.map(lambda row: eliminated.solve(unit(row)), rows.reshape(-1))
+            blocks = self._scatter(eliminated, solved).reshape(count, 6, count, 6)
         free = ~self.problem.gauge.fixed[cameras]
         return jnp.where((free[:, None] & free[None, :])[:, None, :, None], _finite(blocks), 0.0)
 
@@ -72,17 +79,25 @@ class BundleEstimate(eqx.Module):
             Covariances; zero along directions that are undetermined (see ``point_ok``).
         """
         eliminated = self._factored()
-        zero = Tangent(
-            jnp.zeros((self.value.poses.batch_shape[0], 6), self.cost.dtype), jnp.zeros_like(self.value.points)
-        )
+        still = jnp.zeros((self.value.poses.batch_shape[0], 6), self.cost.dtype)
+        none = jnp.zeros_like(self.value.points)
 
-        def column(point: Int[Array, ""], axis: Int[Array, ""]) -> Float[Array, "3"]:
-            unit = eqx.tree_at(lambda tangent: tangent.points, zero, zero.points.at[point, axis].set(1.0))
-            return eliminated.solve(unit).points[point]
+        def block(point: Int[Array, ""]) -> Float[Array, "3 3"]:
+            unit = lambda axis: Tangent(still, none.at[point, axis].set(1.0))  # noqa: E731
+            solved = jax.lax.map(lambda axis: eliminated.solve(unit(axis)), jnp.arange(3))
+            if isinstance(self.problem.loss, Quadratic):
+                return solved.points[:, point]
+            return self._scatter(eliminated, solved)
 
-        axes = jnp.arange(3)
         # One after the other: a solution is as long as the whole bundle.
-        return _finite(jax.lax.map(lambda point: jax.lax.map(lambda axis: column(point, axis), axes), points))
+        return _finite(jax.lax.map(block, points))
+
+    def _scatter(self, eliminated: Eliminated, solved: Tangent) -> Float[Array, "d d"]:
+        """Covariance under a robust kernel between unknowns, given their columns of the inverse Hessian."""
+        scores = score_products(self.problem, self.value, self.structure, eliminated)
+        spread = jax.lax.map(scores.product, solved)
+        sides = ((spread.cameras, solved.cameras), (spread.points, solved.points))
+        return sum(matmul(a.reshape(a.shape[0], -1), b.reshape(b.shape[0], -1).T) for a, b in sides)
 
     def pose_gaussian(self, camera: Any) -> Gaussian:
         """The pose of one camera as a density: what filters and pose graphs accept."""

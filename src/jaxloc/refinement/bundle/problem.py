@@ -146,6 +146,7 @@ class Sights(eqx.Module):
         rotation: of the cameras.
         slope: derivative of the cost in the frame of the camera; zero where unseen.
         curvature: second derivative of the cost.
+        information: ``w J^T J``, what the observation knows with the weight that it has.
     """
 
     cost: Float[Array, ""]
@@ -154,6 +155,7 @@ class Sights(eqx.Module):
     rotation: Float[Array, "3 3 m"]
     slope: Float[Array, "3 m"]
     curvature: Float[Array, "3 3 m"]
+    information: Float[Array, "3 3 m"]
 
 
 class BundleProblem(eqx.Module):
@@ -235,6 +237,7 @@ class BundleProblem(eqx.Module):
         jacobian = self.inverse_sigma[None] * _along_axes(self.project, frame)
         weight, fall = jax.jvp(self.loss.weight, (squared,), (jnp.ones_like(squared),))
         score = jnp.sum(jacobian * error[None], axis=1)
+        information = weight[None, None] * jnp.sum(jacobian[:, None] * jacobian[None], axis=2)
         if exact:
             curvature = _along_axes(lambda c: jax.vjp(self.item_cost, c)[1](jnp.ones_like(squared))[0], frame)
         else:
@@ -242,11 +245,10 @@ class BundleProblem(eqx.Module):
             fall = jnp.where(
                 positive & near, jnp.maximum(2.0 * fall, -0.9 * weight / jnp.where(positive, squared, 1.0)), 0.0
             )
-            curvature = weight[None, None] * jnp.sum(jacobian[:, None] * jacobian[None], axis=2)
-            curvature = curvature + (fall[None] * score)[:, None] * score[None]
+            curvature = information + (fall[None] * score)[:, None] * score[None]
         slope = jnp.where(seen[None], weight[None] * score, 0.0)
-        curvature = jnp.where(seen[None, None], curvature, 0.0)
-        return Sights(self._total(self.loss.rho(squared), seen), seen, frame, rotation, slope, curvature)
+        curvature, information = (jnp.where(seen[None, None], part, 0.0) for part in (curvature, information))
+        return Sights(self._total(self.loss.rho(squared), seen), seen, frame, rotation, slope, curvature, information)
 
     def gradient(self, state: Bundle, structure: Structure) -> tuple[Float[Array, "c 6"], Float[Array, "n 3"]]:
         """Derivative of the exact objective along the tangents of the cameras and of the points."""

@@ -106,6 +106,29 @@ def normal_equations(
 ) -> tuple[Float[Array, ""], Tangent, Arrow]:
     """Cost, gradient and Hessian: Gauss and Newton's with the weights of the kernels, or exact."""
     sights = problem.sights(state, near=near, exact=exact)
+    gradient, arrow = _sums(problem, state, sights, structure, exact)
+    return sights.cost + problem.gauge.cost(state.poses), gradient, arrow
+
+
+def score_products(problem: BundleProblem, state: Bundle, structure: Structure, eliminated: Eliminated) -> Arrow:
+    """How far the slopes of single observations scatter: the middle of the covariance ``H^-1 B H^-1`` of M-estimates.
+
+    Each slope counts over one minus the share that its observation has in its own point, which was drawn towards it;
+    the share in its camera, one of hundreds, is left out. See `jaxloc.solvers.problem.sandwich`.
+    """
+    sights = problem.sights(state)
+    turned = jnp.moveaxis(eliminated.lower, 0, -1)[:, :, problem.point]
+    turned = jnp.sum(turned[:, :, None] * sights.rotation[None], axis=1)
+    share = jnp.sum(sights.information * jnp.sum(turned[:, :, None] * turned[:, None], axis=0), axis=(0, 1))
+    slope = sights.slope / (1.0 - jnp.clip(share / problem.measured.shape[0], 0.0, 0.9))[None]
+    sights = eqx.tree_at(lambda s: s.curvature, sights, slope[:, None] * slope[None])
+    return _sums(problem, state, sights, structure, False)[1]
+
+
+def _sums(
+    problem: BundleProblem, state: Bundle, sights: Sights, structure: Structure, exact: bool
+) -> tuple[Tangent, Arrow]:
+    """Slopes and curvatures of all sights and of the gauge."""
     pose_pose, cross, point_point = _blocks(sights, exact)
     free = ~problem.gauge.fixed
     at_sight = free[problem.camera]
@@ -113,13 +136,12 @@ def normal_equations(
     by_camera = structure.by_camera.sum(slope.T)
     on_point = jnp.sum(sights.rotation * sights.slope[None], axis=1)
     by_point = structure.by_point.sum(jnp.concatenate([on_point, point_point.reshape(9, -1)]).T)
-    gauge = problem.gauge
-    cameras = by_camera[:, 6:].reshape(-1, 6, 6) + gauge.curvatures(state.poses, exact)
+    cameras = by_camera[:, 6:].reshape(-1, 6, 6) + problem.gauge.curvatures(state.poses, exact)
     cameras = jnp.where(free[:, None, None], cameras, jnp.eye(6, dtype=cameras.dtype)[None])
-    gradient = jnp.where(free[:, None], by_camera[:, :6] + gauge.slopes(state.poses), 0.0)
+    gradient = jnp.where(free[:, None], by_camera[:, :6] + problem.gauge.slopes(state.poses), 0.0)
     rows = jnp.where(at_sight[None], cross.reshape(18, -1), 0.0).T.reshape(-1, 6, 3)
     arrow = Arrow(cameras, by_point[:, 3:].reshape(-1, 3, 3), rows, problem.camera, problem.point)
-    return sights.cost + gauge.cost(state.poses), Tangent(gradient, by_point[:, :3]), arrow
+    return Tangent(gradient, by_point[:, :3]), arrow
 
 
 def _blocks(sights: Sights, exact: bool) -> tuple[Float[Array, "6 6 m"], Float[Array, "6 3 m"], Float[Array, "3 3 m"]]:
