@@ -15,11 +15,11 @@ from jaxloc.poses import SE2
 from jaxloc.refinement.association import (
     Blocks,
     Conditioning,
-    Consensus,
     CornerStrength,
     Curvature,
     Features,
     Identity,
+    PairConsensus,
     PoseGate,
     Richness,
     Separation,
@@ -129,7 +129,7 @@ RECORDS = {
     "richness": Richness(),
     "pose": PoseGate(),
     "separation": Separation(),
-    "consensus": Consensus(),
+    "consensus": PairConsensus(),
     "conditioning": Conditioning(),
 }
 

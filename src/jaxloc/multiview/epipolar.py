@@ -104,18 +104,23 @@ def epipoles(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Arra
         >>> [jnp.abs(e).tolist() for e in jl.multiview.epipolar.epipoles(ahead)]
         [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]
     """
-    return null_vector(matrix.T), null_vector(matrix)
+    return null_vector(matrix.T)[0], null_vector(matrix)[0]
 
 
-def null_vector(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Unit vector at right angles to the rows of a matrix of rank two: the largest of their cross products."""
-    a, b, c = matrix
+def null_vector(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
+    """Unit vector at right angles to the rows of a matrix of rank two, and whether its rank is two at least.
+
+    The largest of the rows' cross products, of a matrix of any scale; the third axis for a lower rank.
+    """
+    squared = jnp.sum(matrix * matrix)
+    some = jnp.isfinite(squared) & (squared > 0)
+    a, b, c = jnp.where(some, matrix, 0.0) / jnp.sqrt(jnp.where(some, squared, 1.0))
     products = jnp.stack([jnp.cross(a, b), jnp.cross(b, c), jnp.cross(c, a)])
     squares = jnp.sum(products * products, axis=1)
     best = jnp.argmax(squares)
-    known = squares[best] > 0
+    known = squares[best] > float(jnp.finfo(matrix.dtype).eps) ** 2
     vector = jnp.where(known, products[best], jnp.array([0.0, 0.0, 1.0], matrix.dtype))
-    return vector / jnp.sqrt(jnp.where(known, squares[best], 1.0))
+    return vector / jnp.sqrt(jnp.where(known, squares[best], 1.0)), known
 
 
 def unit_rays(rays: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

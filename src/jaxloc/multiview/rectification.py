@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc.images import Homography
+from jaxloc.multiview.epipolar import null_vector
 from jaxloc.poses import SE3, SO3
 from jaxloc.poses.group import matmul, skew
 from jaxloc.sensors import Pinhole, StereoRig
@@ -160,7 +161,7 @@ def rectifying_homographies(
     weight = (finite if valid is None else finite & valid).astype(first.dtype)
     first, second = (jnp.where(weight[:, None] > 0, points, 0.0) for points in (first, second))
     matrix = jnp.where(jnp.isfinite(fundamental), fundamental, 0.0)
-    epipole, known = _null_vector(matrix)
+    epipole, known = null_vector(matrix)
     of_second, outside = _to_infinity(epipole, shape)
     # Any map that carries epipolar lines: F^T = [e] M.
     transfer = matmul(skew(epipole), _unit(matrix.T)) + epipole[:, None] * jnp.ones((1, 3), epipole.dtype)
@@ -178,16 +179,6 @@ def rectifying_homographies(
 def _unit(matrix: Array) -> Array:
     squared = jnp.sum(matrix * matrix)
     return matrix / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-
-
-def _null_vector(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
-    """Unit vector at right angles to the rows of a matrix of rank two."""
-    a, b, c = _unit(matrix)
-    products = jnp.stack([jnp.cross(a, b), jnp.cross(b, c), jnp.cross(c, a)])
-    squares = jnp.sum(products * products, axis=1)
-    best = jnp.argmax(squares)
-    known = squares[best] > float(jnp.finfo(matrix.dtype).eps) ** 2
-    return jnp.where(known, products[best], 1.0) / jnp.sqrt(jnp.where(known, squares[best], 3.0)), known
 
 
 def _to_infinity(epipole: Float[Array, "3"], shape: tuple[int, int]) -> tuple[Float[Array, "3 3"], Bool[Array, ""]]:

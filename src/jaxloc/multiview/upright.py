@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc.multiview.epipolar import depth_signs, null_vector
 from jaxloc.multiview.minimal import MinimalPoses
 from jaxloc.poses import SE3, SO3
 
@@ -134,11 +135,13 @@ def upright_relative(first: Float[Array, "3 3"], second: Float[Array, "3 3"]) ->
         steep = real & (jnp.abs(lax.stop_gradient(value)) <= tolerance) & (slope != 0)
         angle = angle - jnp.where(steep, value / jnp.where(slope != 0, slope, 1.0), 0.0)
         turn = _about_y(jnp.cos(angle), jnp.sin(angle))
-        direction, known = _null_vector(_rows(first, second, turn))
         turned = jnp.sum(turn[None] * second[:, None, :], axis=2)
-        ahead, behind = (_all_ahead(first, turned, sign * direction) for sign in (1.0, -1.0))
-        direction = jnp.where(behind & ~ahead, -direction, direction)
-        return SE3(SO3(turn), direction), steep & known & (ahead | behind)
+        rows = jnp.cross(turned, first)
+        direction, known = null_vector(rows)
+        apart = jnp.max(jnp.abs(rows)) > 10.0 * float(jnp.finfo(rows.dtype).eps)
+        signs = depth_signs(direction, first, turned)
+        ahead, behind = jnp.all(signs > 0), jnp.all(signs < 0)
+        return SE3(SO3(turn), jnp.where(behind, -direction, direction)), steep & known & apart & (ahead | behind)
 
     poses, valid = jax.vmap(pose)(angles, real)
     return MinimalPoses(poses, valid & _once(angles, valid))
@@ -232,25 +235,6 @@ def _largest_root(a: Array, b: Array, c: Array) -> Array:
     radius = jnp.sqrt(jnp.maximum(-p, 0.0))
     ratio = jnp.clip(-q / jnp.where(radius > 0, radius, 1.0) ** 3, -1.0, 1.0)
     return jnp.where(discriminant > 0, single, 2.0 * radius * jnp.cos(jnp.arccos(ratio) / 3.0)) - shift
-
-
-def _null_vector(rows: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
-    """Unit vector at right angles to three rows of rank two: the largest of their cross products."""
-    products = jnp.stack([jnp.cross(rows[i], rows[j]) for i, j in ((0, 1), (1, 2), (2, 0))])
-    squares = jnp.sum(products * products, axis=1)
-    best = jnp.argmax(squares)
-    known = squares[best] > 1e2 * float(jnp.finfo(rows.dtype).eps) ** 2
-    ahead = jnp.array([0.0, 0.0, 1.0], rows.dtype)
-    vector = jnp.where(known, products[best], ahead)
-    return vector / jnp.sqrt(jnp.where(known, squares[best], 1.0)), known
-
-
-def _all_ahead(first: Array, turned: Array, direction: Array) -> Bool[Array, ""]:
-    """Whether all pairs of rays meet ahead of both cameras."""
-    cross = jnp.cross(first, turned)
-    shift = jnp.broadcast_to(direction, first.shape)
-    left, right = jnp.cross(shift, turned), jnp.cross(shift, first)
-    return jnp.all(jnp.sum(left * cross, axis=1) > 0) & jnp.all(jnp.sum(right * cross, axis=1) > 0)
 
 
 def _once(angles: Float[Array, "4"], valid: Bool[Array, "4"]) -> Bool[Array, "4"]:

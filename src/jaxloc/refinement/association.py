@@ -34,12 +34,12 @@ __all__ = [
     "Attribute",
     "Blocks",
     "Conditioning",
-    "Consensus",
     "CornerStrength",
     "Costs",
     "Curvature",
     "Features",
     "Identity",
+    "PairConsensus",
     "PoseGate",
     "Richness",
     "Separation",
@@ -98,7 +98,7 @@ class Separation(eqx.Module):
     margin: float = 4.0
 
 
-class Consensus(eqx.Module):
+class PairConsensus(eqx.Module):
     """Pairs that few others agree with cost more.
 
     Attributes:
@@ -128,7 +128,7 @@ class Sources(eqx.Module):
     richness: Richness | None = Richness()
     pose: PoseGate | None = PoseGate()
     separation: Separation | None = Separation()
-    consensus: Consensus | None = Consensus()
+    consensus: PairConsensus | None = PairConsensus()
     conditioning: Conditioning | None = Conditioning()
 
 
@@ -260,7 +260,7 @@ def _mahalanobis(pose: Gaussian, seen: Array, known: Array, sigma: Any) -> Float
 
 
 def _lacking_support(
-    consensus: Consensus, seen: Array, known: Array, feasible: Bool[Array, "n m"], sigma: Any
+    consensus: PairConsensus, seen: Array, known: Array, feasible: Bool[Array, "n m"], sigma: Any
 ) -> Float[Array, "n m"]:
     """Cost of a pair (i, j): the part of the other features k that have no l with ``|x_i - x_k| = |y_j - y_l|``."""
     spread = jnp.asarray(2.0 * sigma if consensus.sigma is None else consensus.sigma, seen.dtype)

@@ -7,10 +7,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc.poses.group import matmul
+
 _TOGETHER = 64
 
 
-class Direction(eqx.Module):
+class DominantDirection(eqx.Module):
     """Directions of neighborhoods.
 
     Attributes:
@@ -25,7 +27,7 @@ class Direction(eqx.Module):
 @eqx.filter_jit
 def dominant_direction(
     right: Float[Array, "n k"], down: Float[Array, "n k"], *, width: float = math.pi / 3.0
-) -> Direction:
+) -> DominantDirection:
     """Direction of the longest sum of slopes within a window of directions.
 
     Every slope begins a window in turn: no other window holds more, and nothing depends on where angles begin.
@@ -51,14 +53,14 @@ def dominant_direction(
         angle = jnp.arctan2(frozen_down, frozen_right)
         ahead = (angle[None, :] - angle[:, None]) % (2.0 * math.pi)
         within = (ahead < width).astype(right.dtype)
-        sums = within @ jnp.stack([frozen_right, frozen_down], axis=1)
+        sums = matmul(within, jnp.stack([frozen_right, frozen_down], axis=1))
         members = within[jnp.argmax(jnp.sum(sums * sums, axis=1))]
         return jnp.sum(members * right), jnp.sum(members * down)
 
     total_right, total_down = lax.map(one, (right, down), batch_size=min(_TOGETHER, max(len(right), 1)))
     some = total_right**2 + total_down**2 > 0
     angle = jnp.arctan2(jnp.where(some, total_down, 0.0), jnp.where(some, total_right, 1.0))
-    return Direction(angle % (2.0 * math.pi), some)
+    return DominantDirection(angle % (2.0 * math.pi), some)
 
 
 def disc(radius: int) -> tuple[list[int], list[int]]:
