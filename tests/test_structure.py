@@ -108,6 +108,22 @@ def test_everything_public_is_documented(path):
     assert not missing, f"no docstring: {missing}"
 
 
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_products_are_exact(path):
+    """Accelerators round the factors of a product to ten bits, unless it asks for precision."""
+    products = {"einsum", "matmul", "dot", "vdot", "tensordot", "inner", "convolve", "correlate", "dot_general"}
+    modules = {"jnp", "lax", "jax.numpy", "jax.lax"}
+    rounded = [
+        f"line {node.lineno}: {node.func.attr}"
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
+        if (node.func.attr in products or node.func.attr.startswith("conv_"))
+        and ast.unparse(node.func.value) in modules
+        if all(keyword.arg != "precision" for keyword in node.keywords)
+    ]
+    assert not rounded, rounded
+
+
 def test_rooms_import_only_lower_rows():
     if importlib.util.find_spec("importlinter") is None:
         pytest.skip("import-linter is not installed")

@@ -130,14 +130,14 @@ def _null_space(first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> tupl
 def _eliminated(basis: Float[Array, "4 3 3"]) -> tuple[Float[Array, "10 10"], Bool[Array, ""]]:
     """The ten cubic equations, solved for the first ten monomials."""
     squares, cubes = (jnp.asarray(table, basis.dtype) for table in (_SQUARES, _CUBES))
-    products = jnp.einsum("aik,bjk,cab->ijc", basis, basis, squares)
+    products = jnp.einsum("aik,bjk,cab->ijc", basis, basis, squares, precision="highest")
     trace = products[0, 0] + products[1, 1] + products[2, 2]
     centered = products - 0.5 * jnp.eye(3, dtype=basis.dtype)[:, :, None] * trace[None, None, :]
-    nine = jnp.einsum("ikc,akj,dca->ijd", centered, basis, cubes).reshape(9, 20)
-    minors = jnp.einsum("ai,bj,cab->ijc", basis[:, 1], basis[:, 2], squares)
+    nine = jnp.einsum("ikc,akj,dca->ijd", centered, basis, cubes, precision="highest").reshape(9, 20)
+    minors = jnp.einsum("ai,bj,cab->ijc", basis[:, 1], basis[:, 2], squares, precision="highest")
     minors = minors - jnp.swapaxes(minors, 0, 1)
     cofactors = jnp.stack([minors[1, 2], minors[2, 0], minors[0, 1]])
-    last = jnp.einsum("ic,ai,dca->d", cofactors, basis[:, 0], cubes)
+    last = jnp.einsum("ic,ai,dca->d", cofactors, basis[:, 0], cubes, precision="highest")
     system = jnp.concatenate([nine, last[None]])
     solved = jnp.linalg.solve(system[:, :10], system[:, 10:])
     regular = jnp.all(jnp.isfinite(solved))
@@ -256,7 +256,7 @@ def decompose(essential: Float[Array, "3 3"]) -> RelativePose:
     """
     squared = jnp.sum(essential * essential)
     unit = essential * jnp.sqrt(2.0 / jnp.where(squared > 0, squared, 1.0))
-    direction = null_vector(unit.T)
+    direction, _ = null_vector(unit.T)
     return RelativePose(Direction(direction), _rotation(unit, direction))
 
 

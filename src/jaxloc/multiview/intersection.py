@@ -85,12 +85,12 @@ def correct_pair(
     x, y = jnp.concatenate([first, one]), jnp.concatenate([second, one])
     image, back = matmul(matrix, y), matmul(matrix.T, x)
     inner, n, m = matrix[:2, :2], image[:2], back[:2]
-    a, b, c = jnp.dot(n, matmul(inner, m)), 0.5 * (jnp.dot(n, n) + jnp.dot(m, m)), jnp.dot(x, image)
+    a, b, c = jnp.sum(n * matmul(inner, m)), 0.5 * (jnp.sum(n * n) + jnp.sum(m * m)), jnp.sum(x * image)
     discriminant = b * b - a * c
     root = jnp.where(discriminant > 0, jnp.sqrt(jnp.where(discriminant > 0, discriminant, 1.0)), 0.0)
     step = _ratio(c, b + root)
     n, m = n - step * matmul(inner, m), m - step * matmul(inner.T, n)
-    step = step * _ratio(2.0 * root, jnp.dot(n, n) + jnp.dot(m, m))
+    step = step * _ratio(2.0 * root, jnp.sum(n * n) + jnp.sum(m * m))
     return first - step * n, second - step * m
 
 

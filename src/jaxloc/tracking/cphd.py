@@ -80,7 +80,8 @@ class GmCphd(Tracker):
         mixture = predict(state.mixture, self.phd, control, first_label=state.num_labels)
         born = mixture.weights[state.mixture.capacity :]
         survivors = survive(state.cardinality, self.phd.model.survival)
-        sums = jnp.convolve(survivors, _poisson(jnp.sum(born), self.max_targets))[: self.max_targets + 1]
+        births = _poisson(jnp.sum(born), self.max_targets)
+        sums = jnp.convolve(survivors, births, precision="highest")[: self.max_targets + 1]
         sums = sums / jnp.sum(sums)
         return CphdState(mixture, sums, state.step + 1, state.num_labels + born.shape[0])
 
