@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.metric import ACCURACY, TIME, Metric, compiled, quickest, versus
+from benchmarks.metric import ACCURACY, TIME, Metric, compiled, gradient_over_forward, quickest, versus
 from jaxloc.data.simulate.pallet import make_camera, render_pallet
 from jaxloc.poses import SE2
 from jaxloc.refinement.correspondences import (
@@ -84,6 +84,8 @@ def _kind(kind: str, batch: int, repeats: int) -> Iterator[Metric]:
     squared = jax.jit(jax.vmap(lambda f: f.gaussian().mahalanobis_squared(truth)))(found)
     key = f"features_to_pose.{kind}"
     yield Metric(key, 1e6 * took.wall / batch, "us", "lower", TIME)
+    total = lambda arrays: jnp.sum(jax.vmap(fit)(arrays).value.translation)  # noqa: E731
+    yield gradient_over_forward(key, total, (arrays,), took, repeats)
     yield Metric(f"{key}.ok", float(jnp.mean(found.ok)), "share", "higher", 0.01)
     yield Metric(f"{key}.nees", float(jnp.mean(squared)), "of 3", "equal", ACCURACY)
     away = jnp.linalg.norm(found.value.translation - jnp.asarray(POSE[:2], jnp.float32)[None, :], axis=1)
@@ -143,6 +145,8 @@ def _pallet(count: int, repeats: int) -> Iterator[Metric]:
         yield Metric(f"features_to_pose.pallet.{x:g}m.right", float(np.mean(right)), "share", "higher", 0.01)
     took = quickest(lambda: detect(image), repeats)
     yield Metric("features_to_pose.pallet.three_kinds", 1e3 * took.wall, "ms", "lower", TIME)
+    total = lambda image: jnp.sum(detect_pallet(image, camera, kinds).estimate.value.translation)  # noqa: E731
+    yield gradient_over_forward("features_to_pose.pallet", total, (image,), took, repeats)
     if repeats > 1:
         alone = eqx.filter_jit(lambda image: find_pallet(image, camera, kinds[:1]))
         took = quickest(lambda: alone(image), repeats)
@@ -176,9 +180,13 @@ def _flow(batch: int, repeats: int) -> Iterator[Metric]:
     peer = quickest(lambda: [np.linalg.lstsq(m, f, rcond=None)[0] for m, f in rows] and None, repeats)
     yield Metric("features_to_pose.flow.twist.numpy", 1e6 * peer.wall / batch, "us")
     yield from versus("features_to_pose.flow.twist.vs_numpy", took, peer)
-    free, _ = compiled(jax.vmap(lambda p, f: motion_from_flow(p, f, sigma=FLOW_SIGMA)), *arrays[:2])
-    took = quickest(lambda: free(*arrays[:2]), repeats)
-    found = free(*arrays[:2])
+    each = jax.vmap(lambda f, p: motion_from_flow(p, f, sigma=FLOW_SIGMA))
+    seen = (arrays[1], arrays[0])
+    free, _ = compiled(each, *seen)
+    took = quickest(lambda: free(*seen), repeats)
+    total = lambda f, p: jnp.sum(each(f, p).value.direction.vector)  # noqa: E731
+    yield gradient_over_forward("features_to_pose.flow.motion", total, seen, took, repeats)
+    found = free(*seen)
     cosine = found.value.direction.vector @ jnp.asarray(TWIST[:3] / np.linalg.norm(TWIST[:3]), jnp.float32)
     yield Metric("features_to_pose.flow.motion", 1e6 * took.wall / batch, "us", "lower", TIME)
     yield Metric("features_to_pose.flow.motion.ok", float(jnp.mean(found.ok)), "share", "higher", 0.01)

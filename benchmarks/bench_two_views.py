@@ -10,7 +10,7 @@ import numpy as np
 import poselib
 from scipy.spatial.transform import Rotation
 
-from benchmarks.metric import ACCURACY, TIME, Metric, Timing, compiled, quickest, timed, versus
+from benchmarks.metric import ACCURACY, TIME, Metric, Timing, compiled, gradient_over_forward, quickest, timed, versus
 from jaxloc.multiview import estimate_homography, estimate_relative_pose
 from jaxloc.multiview.five_point import five_point
 from jaxloc.solvers import Estimate
@@ -83,6 +83,8 @@ def _relative_pose(count: int, repeats: int) -> Iterator[Metric]:
     yield Metric("two_views.pose.compile", building.cpu, "s", "lower", TIME)
     took = quickest(lambda: run(first, second, keys), repeats)
     yield Metric("two_views.pose", 1e3 * took.wall / count, "ms", "lower", TIME)
+    total = lambda *sets: jnp.sum(jax.vmap(one)(*sets).value.direction.vector)  # noqa: E731
+    yield gradient_over_forward("two_views.pose", total, (first, second, keys), took, max(repeats // 3, 1))
     matrix = np.array([[FOCAL, 0, 0], [0, FOCAL, 0], [0, 0, 1]])
     for name, method in (("magsac", cv2.USAC_MAGSAC), ("ransac", cv2.RANSAC)):
         peer, took_peer = timed(lambda method=method: np.stack([_opencv(v, matrix, method) for v in views]))
@@ -178,7 +180,8 @@ def _homography(count: int, repeats: int) -> Iterator[Metric]:
     first = first + SIGMA * rng.normal(size=first.shape)
     arrays = jnp.asarray(first, jnp.float32), jnp.asarray(second, jnp.float32)
     keys = jax.random.split(jax.random.key(0), count)
-    run, _ = compiled(jax.vmap(lambda a, b, key: estimate_homography(a, b, key=key, sigma=SIGMA)), *arrays, keys)
+    each = jax.vmap(lambda a, b, key: estimate_homography(a, b, key=key, sigma=SIGMA))
+    run, _ = compiled(each, *arrays, keys)
     found = run(*arrays, keys)
     corners = np.array([[0.0, 0.0], [600.0, 0.0], [600.0, 600.0], [0.0, 600.0]])
 
@@ -196,6 +199,8 @@ def _homography(count: int, repeats: int) -> Iterator[Metric]:
     yield Metric("two_views.homography.ok", float(jnp.mean(found.ok)), "share", "higher", 0.01)
     took = quickest(lambda: run(*arrays, keys), repeats)
     yield Metric("two_views.homography", 1e3 * took.wall / count, "ms", "lower", TIME)
+    total = lambda *sets: jnp.sum(each(*sets).value.homogeneous)  # noqa: E731
+    yield gradient_over_forward("two_views.homography", total, (*arrays, keys), took, max(repeats // 3, 1))
     peer: tuple[list[np.ndarray], Timing] = timed(
         lambda: [cv2.findHomography(a, b, cv2.USAC_MAGSAC, 2.58 * SIGMA)[0] for a, b in zip(first, second, strict=True)]
     )

@@ -84,6 +84,15 @@ def versus(key: str, ours: Timing, peer: Timing) -> list[Metric]:
     ]
 
 
+def gradient_over_forward(
+    key: str, total: Callable[..., jax.Array], arguments: tuple[Any, ...], forward: Timing, repeats: int
+) -> Metric:
+    """Processor time of a number with its derivatives by the first argument, over that of the estimate alone."""
+    run, _ = compiled(jax.value_and_grad(total), *arguments)
+    took = quickest(lambda: run(*arguments), repeats)
+    return Metric(f"{key}.gradient_over_forward", took.cpu / forward.cpu, "x", "lower", RATIO)
+
+
 def in_fresh_process(module: str, function: str, *arguments: str, environment: Mapping[str, str] | None = None) -> Any:
     """Result (of plain numbers) of ``module.function(*arguments)`` in a process of its own."""
     code = (
