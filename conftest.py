@@ -1,6 +1,7 @@
 """How the suite runs: strict dtypes and ranks, warnings are errors, compiled programs kept between runs."""
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -10,6 +11,10 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parent
 RECORDINGS = REPOSITORY.parent / "shared" / "data"
 _CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".jax_cache"))
+
+# Half the time of compiling. XLA ends a process that gives it a flag it does not know: only where it was tried.
+if version("jaxlib").startswith("0.10."):
+    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
