@@ -43,6 +43,22 @@ def test_all_extrema_equal_a_plain_search(x64, rng):
     assert 0.2 * inner < int(found.valid.sum()) <= inner
 
 
+def test_flat_extrema_are_those_of_each_layer(x64, rng):
+    """Layers do not see each other, and the first and the last count."""
+    stack = np.stack(
+        [paraboloid((2.0, 9.4, 11.7))[2], np.zeros(SHAPE[1:]), paraboloid((2.0, 12.2, 20.4), height=5.0)[2]]
+    )
+    found = first(stack, flat=True)
+    assert found.valid.tolist() == [True, True] + 4 * [False]
+    np.testing.assert_allclose(found.place[:2], [[0.0, 9.4, 11.7], [2.0, 12.2, 20.4]], atol=1e-9)
+    np.testing.assert_allclose(found.value[:2], [9.0, 5.0], atol=1e-9)
+    noise = rng.normal(size=SHAPE)
+    test = ExtremumTest(0.5, 1e9, flat=True)
+    together = find_extrema(jnp.asarray(noise), test, capacity=400)
+    alone = [find_extrema(jnp.asarray(layer[None]), test, capacity=400) for layer in noise]
+    assert int(together.valid.sum()) == sum(int(found.valid.sum()) for found in alone) > 0
+
+
 def test_faint_ones_and_edges_are_dropped():  # T-31, T-32
     center = (2.2, 9.4, 11.7)
     assert not first(paraboloid(center, height=0.9)).valid.any()

@@ -7,12 +7,12 @@ import pytest
 from scipy import ndimage
 
 from jaxloc.images.diffused import DiffusedScaleSpace, ExplicitCycle, Splitting
-from jaxloc.images.diffused.scale_space import REACH, stacks
+from jaxloc.images.diffused.scale_space import stacks
 from jaxloc.images.diffusion import LARGEST_STEP, Linear, conductance, contrast, diffuse_implicit
 from jaxloc.images.gradients import smooth
 
-FULL = DiffusedScaleSpace(octaves=1)
-HALVED = DiffusedScaleSpace(octaves=2, halved=True, scheme=ExplicitCycle())
+FULL = DiffusedScaleSpace(octaves=1, reach=1.5)
+HALVED = DiffusedScaleSpace.accelerated(octaves=2)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def spread_kernel(reach):
 def test_derivatives_equal_plain_kernels(picture, x64):
     found = stacks(jnp.asarray(picture), FULL)[0]
     for k, blur in enumerate(FULL.blurs(4)):
-        reach = round(REACH * blur)
+        reach = round(FULL.reach * blur)
         layer, kernel = np.asarray(smooth(found.layers[k], 1.0)), spread_kernel(reach)
         right, down = (ndimage.correlate(layer, m, mode="mirror") for m in (kernel, kernel.T))
         uu, vv, uv = (ndimage.correlate(a, m) for a, m in ((right, kernel), (down, kernel.T), (right, kernel.T)))
@@ -41,7 +41,7 @@ def test_derivatives_equal_plain_kernels(picture, x64):
         for ours, theirs in (
             (found.right, right),
             (found.down, down),
-            (found.determinant, (REACH * blur) ** 4 * (uu * vv - uv**2)),
+            (found.determinant, (FULL.reach * blur) ** 4 * (uu * vv - uv**2)),
         ):
             np.testing.assert_allclose(ours[k][inside], theirs[inside], atol=1e-8 * np.abs(theirs).max())
 

@@ -30,12 +30,14 @@ class ExtremumTest(eqx.Module):
         edge_ratio: greatest ratio of principal curvatures in the picture.
         border: width of the margin without extrema, samples.
         minima: whether minima count as well as maxima.
+        flat: each layer by itself, the first and last too: extrema among 8 neighbors, which stay in their layer.
     """
 
     least_value: float | Float[Array, ""]
     edge_ratio: float | Float[Array, ""] = 10.0
     border: int = eqx.field(static=True, default=5)
     minima: bool = eqx.field(static=True, default=True)
+    flat: bool = eqx.field(static=True, default=False)
 
 
 @eqx.filter_jit
@@ -65,21 +67,23 @@ def find_extrema(stack: Float[Array, "s h w"], test: ExtremumTest, *, capacity: 
     stack = jnp.where(jnp.isfinite(stack), stack, 0.0)
     _, height, width = stack.shape
     strength = lax.stop_gradient(jnp.where(_is_extremum(stack, test), jnp.abs(stack), 0.0))
-    inner = strength[1:-1].reshape(-1)
+    first = 0 if test.flat else 1
+    inner = strength[first : stack.shape[0] - first].reshape(-1)
     count = min(capacity, inner.shape[0])
     strongest, index = lax.top_k(inner, count)
     index = jnp.where(strongest > 0, index, 0)
-    start = jnp.stack([index // (height * width) + 1, index // width % height, index % width], axis=1)
+    start = jnp.stack([index // (height * width) + first, index // width % height, index % width], axis=1)
     found = _interpolate(stack, start.astype(jnp.int32), strongest > 0, test)
     pad = [(0, capacity - count)]
     return Extrema(jnp.pad(found.place, [*pad, (0, 0)]), jnp.pad(found.value, pad), jnp.pad(found.valid, pad))
 
 
 def _is_extremum(stack: Float[Array, "s h w"], test: ExtremumTest) -> Bool[Array, "s h w"]:
-    greatest = _neighborhood(stack, jnp.maximum, -jnp.inf)
+    axes = (1, 2) if test.flat else (0, 1, 2)
+    greatest = _neighborhood(stack, jnp.maximum, -jnp.inf, axes)
     extreme = (stack >= greatest) & (stack > 0.5 * test.least_value)
     if test.minima:
-        least = _neighborhood(stack, jnp.minimum, jnp.inf)
+        least = _neighborhood(stack, jnp.minimum, jnp.inf, axes)
         extreme |= (stack <= least) & (stack < -0.5 * test.least_value)
     _, height, width = stack.shape
     margin = max(test.border, 1)
@@ -88,9 +92,9 @@ def _is_extremum(stack: Float[Array, "s h w"], test: ExtremumTest) -> Bool[Array
     return extreme & rows[None, :, None] & columns[None, None, :]
 
 
-def _neighborhood(stack: Array, better: object, outside: float) -> Array:
-    """The best of each sample's 3x3x3 neighborhood, one axis after the other."""
-    for axis in range(3):
+def _neighborhood(stack: Array, better: object, outside: float, axes: tuple[int, ...]) -> Array:
+    """The best of each sample's neighborhood of three samples along axes, one after the other."""
+    for axis in axes:
         edges = [(1, 1) if axis == k else (0, 0) for k in range(3)]
         padded, size = jnp.pad(stack, edges, constant_values=outside), stack.shape[axis]
         before, after = (lax.slice_in_dim(padded, start, start + size, axis=axis) for start in (0, 2))
@@ -101,12 +105,12 @@ def _neighborhood(stack: Array, better: object, outside: float) -> Array:
 def _interpolate(stack: Array, start: Int[Array, "n 3"], valid: Bool[Array, " n"], test: ExtremumTest) -> Extrema:
     """Moves each extremum by whole samples until its vertex lies within half a sample of it."""
     limits = jnp.asarray(stack.shape, jnp.int32)
-    margin = jnp.asarray([1, max(test.border, 1), max(test.border, 1)], jnp.int32)
+    margin = jnp.asarray([0 if test.flat else 1, max(test.border, 1), max(test.border, 1)], jnp.int32)
     frozen = lax.stop_gradient(stack)
 
     def move(_: object, carried: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         place, alive, settled = carried
-        offset = _vertex(_cubes(frozen, place))[0]
+        offset = _vertex(_cubes(frozen, place), test.flat)[0]
         settled = settled | jnp.all(jnp.abs(offset) < 0.5, axis=1)
         step = jnp.clip(jnp.round(offset), -2.0, 2.0).astype(jnp.int32)
         moved = jnp.where(settled[:, None], place, place + step)
@@ -115,7 +119,7 @@ def _interpolate(stack: Array, start: Int[Array, "n 3"], valid: Bool[Array, " n"
 
     place, alive, settled = lax.fori_loop(0, _MOVES, move, (start, valid, jnp.zeros_like(valid)))
     cubes = _cubes(stack, place)
-    offset, slope, (bend_u, bend_v, twist) = _vertex(cubes)
+    offset, slope, (bend_u, bend_v, twist) = _vertex(cubes, test.flat)
     value = cubes[1][1][1] + 0.5 * jnp.sum(slope * offset, axis=1)
     trace, determinant = bend_u + bend_v, bend_u * bend_v - twist * twist
     ratio = test.edge_ratio
@@ -136,7 +140,7 @@ def _cubes(stack: Float[Array, "s h w"], place: Int[Array, "n 3"]) -> list[list[
     return [[[samples[9 * a + 3 * b + c] for c in range(3)] for b in range(3)] for a in range(3)]
 
 
-def _vertex(cubes: list[list[list[Array]]]) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+def _vertex(cubes: list[list[list[Array]]], flat: bool) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Offset of the paraboloid's vertex, the slope at the middle, and the second derivatives in the picture."""
     middle = cubes[1][1][1]
     slope_s = 0.5 * (cubes[2][1][1] - cubes[0][1][1])
@@ -148,6 +152,9 @@ def _vertex(cubes: list[list[list[Array]]]) -> tuple[Array, Array, tuple[Array, 
     uv = 0.25 * (cubes[1][2][2] - cubes[1][2][0] - cubes[1][0][2] + cubes[1][0][0])
     us = 0.25 * (cubes[2][1][2] - cubes[2][1][0] - cubes[0][1][2] + cubes[0][1][0])
     vs = 0.25 * (cubes[2][2][1] - cubes[2][0][1] - cubes[0][2][1] + cubes[0][0][1])
+    if flat:
+        still = jnp.zeros_like(middle)
+        slope_s, ss, us, vs = still, still - 1.0, still, still
     # Cramer's rule for the symmetric matrix [[ss, vs, us], [vs, vv, uv], [us, uv, uu]].
     a, b, c = vv * uu - uv * uv, us * uv - vs * uu, vs * uv - us * vv
     determinant = ss * a + vs * b + us * c

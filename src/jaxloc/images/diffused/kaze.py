@@ -9,14 +9,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxloc.images.blobs.directions import disc, dominant_direction
 from jaxloc.images.blobs.extrema import ExtremumTest, find_extrema
 from jaxloc.images.diffused.scale_space import (
-    REACH,
     DiffusedScaleSpace,
-    ExplicitCycle,
     Samples,
     Stack,
     read,
@@ -29,8 +27,10 @@ from jaxloc.images.keypoints import Descriptors, Keypoints
 
 # Radius of the orientation and deviation of its Gaussian, in samples.
 _RADIUS, _SPREAD = 6, 2.5
-# Maxima that are looked at for each slot: many lie on ridges, where the paraboloid's vertex runs away.
+# Maxima that are looked at for each slot: many lie on ridges, where the paraboloid's vertex runs away, or have rivals.
 _SURPLUS = 4
+# Keypoints of neighboring layers, whose sizes differ by less, are rivals.
+_ALIKE = 1.35
 
 
 class Kaze(eqx.Module):
@@ -39,12 +39,15 @@ class Kaze(eqx.Module):
     Attributes:
         scales: the nonlinear scale space.
         words: descriptors, `MSurf` or `MLdb`.
+        flat: a keypoint is a maximum of its layer with no stronger one near it in the next layers (A-KAZE), not a
+            maximum over place and scale (KAZE).
         least_response: least determinant of a keypoint, as a share of 255^2.
         upright: all keypoints point to the right: for cameras that do not roll.
     """
 
     scales: DiffusedScaleSpace = DiffusedScaleSpace()
     words: Words = MSurf()
+    flat: bool = eqx.field(static=True, default=False)
     least_response: float = eqx.field(static=True, default=1e-3)
     upright: bool = eqx.field(static=True, default=False)
 
@@ -56,15 +59,16 @@ class Kaze(eqx.Module):
             >>> type(Kaze.accelerated().words).__name__
             'MLdb'
         """
-        return cls(DiffusedScaleSpace(halved=True, scheme=ExplicitCycle()), MLdb())
+        return cls(DiffusedScaleSpace.accelerated(), MLdb(), flat=True)
 
 
 @eqx.filter_jit
 def kaze(image: Float[Array, "h w"], *, options: Kaze = Kaze(), capacity: int = 1000) -> tuple[Keypoints, Descriptors]:
     """Keypoints with scale and orientation, and their descriptors.
 
-    Maxima of the determinant of the Hessian over place and scale, moved to the vertex of a paraboloid; their direction
-    is that of most derivatives within a window of 60 degrees.
+    Maxima of the determinant of the Hessian, moved to the vertex of a paraboloid, unless a stronger one of about their
+    size lies within the reach of their derivatives; their direction is that of most derivatives within a window of 60
+    degrees.
 
     Args:
         image: grey levels 0-255.
@@ -72,7 +76,7 @@ def kaze(image: Float[Array, "h w"], *, options: Kaze = Kaze(), capacity: int = 
         capacity: keypoints that are kept, the strongest first.
 
     Returns:
-        Keypoints (``size`` is three blurs, as in OpenCV) and their descriptors.
+        Keypoints and their descriptors. ``size`` is twice the reach, as in OpenCV: 2 blurs for KAZE, 3 for A-KAZE.
 
     References:
         Alcantarilla et al. 2012, 2013 [T-43, T-48...T-50].
@@ -99,7 +103,7 @@ def describe_kaze(image: Float[Array, "h w"], keypoints: Keypoints, *, options: 
 
     Args:
         image: grey levels 0-255.
-        keypoints: `size` is three blurs.
+        keypoints: `size` is twice the reach of derivatives.
         options: the scale space and the descriptors.
 
     Returns:
@@ -119,7 +123,7 @@ def _strongest(found: tuple[Stack, ...], options: Kaze, capacity: int) -> Keypoi
     """The strongest maxima of the determinants of all stacks."""
     scales, shape, parts = options.scales, found[0].layers.shape[1:], []
     # A ridge of the determinant is no edge of the picture.
-    test = ExtremumTest(255.0**2 * options.least_response, edge_ratio=1e6, minima=False)
+    test = ExtremumTest(255.0**2 * options.least_response, edge_ratio=1e6, minima=False, flat=options.flat)
     for stack in found:
         blobs = find_extrema(stack.determinant, test, capacity=_SURPLUS * capacity)
         sigma = scales.sigma * stack.step * jnp.exp2(blobs.place[:, 0] / scales.layers)
@@ -127,17 +131,30 @@ def _strongest(found: tuple[Stack, ...], options: Kaze, capacity: int) -> Keypoi
         # What its second derivatives reach lies within the picture: large blobs at the border are seldom found again.
         far = jnp.asarray([shape[1] - 1, shape[0] - 1], uv.dtype)[None, :]
         room = jnp.min(jnp.minimum(uv, far - uv), axis=1)
-        parts.append((uv, sigma, blobs.value, blobs.valid & (room >= 2.0 * REACH * sigma)))
+        parts.append((uv, sigma, blobs.value, blobs.valid & (room >= 2.0 * scales.reach * sigma)))
     uv, sigma, value, valid = (jnp.concatenate(column) for column in zip(*parts, strict=True))
-    _, best = lax.top_k(lax.stop_gradient(jnp.where(valid, value, -1.0)), capacity)
-    valid = valid[best]
-    size, none = jnp.where(valid, 2.0 * REACH * sigma[best], 0.0), jnp.zeros(valid.shape, jnp.int32)
-    return Keypoints(uv[best], size, jnp.zeros_like(size), value[best], none, none, valid, "kaze")
+    _, best = lax.top_k(lax.stop_gradient(jnp.where(valid, value, -1.0)), min(_SURPLUS * capacity, value.shape[0]))
+    uv, sigma, value, valid = uv[best], sigma[best], value[best], valid[best]
+    valid = valid & ~_has_rival(*lax.stop_gradient((uv, sigma)), valid, scales.reach)
+    kept = jnp.argsort(~valid, stable=True)[:capacity]
+    uv, sigma, value, valid = uv[kept], sigma[kept], value[kept], valid[kept]
+    size, none = jnp.where(valid, 2.0 * scales.reach * sigma, 0.0), jnp.zeros(valid.shape, jnp.int32)
+    return Keypoints(uv, size, jnp.zeros_like(size), value, none, none, valid, "kaze")
+
+
+def _has_rival(uv: Array, sigma: Array, valid: Array, reach: float) -> Bool[Array, " n"]:
+    """Whether a keypoint that comes before is of about the same size and near: large blobs have several maxima."""
+    squared = sum((uv[:, None, k] - uv[None, :, k]) ** 2 for k in (0, 1))
+    ratio = sigma[:, None] / sigma[None, :]
+    alike = (ratio < _ALIKE) & (ratio > 1.0 / _ALIKE)
+    index = jnp.arange(valid.shape[0])
+    near = squared < (reach * sigma[:, None]) ** 2
+    return jnp.any(near & alike & valid[None, :] & (index[None, :] < index[:, None]), axis=1)
 
 
 def _around(samples: Samples, keypoints: Keypoints, scales: DiffusedScaleSpace, side: tuple, angle: Array) -> tuple:
     """Values on samples (right, down) about each keypoint, turned by an angle."""
-    sigma = jnp.where(keypoints.valid, keypoints.size / (2.0 * REACH), scales.sigma)
+    sigma = jnp.where(keypoints.valid, keypoints.size / (2.0 * scales.reach), scales.sigma)
     seat = seat_of(samples, keypoints.uv, sigma, scales)
     right, down = (jnp.asarray(axis, sigma.dtype)[None, :] for axis in side)
     cos, sin = (f(angle)[:, None] * seat.reach[:, None] for f in (jnp.cos, jnp.sin))

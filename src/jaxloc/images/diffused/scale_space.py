@@ -22,8 +22,6 @@ from jaxloc.images.diffusion import (
 from jaxloc.images.gradients import smooth
 from jaxloc.images.pyramid import halve
 
-# Derivatives reach this many blurs: the factor of the authors' programs.
-REACH = 1.5
 # Shorter side of the smallest octave, px; what the contrast loses with each octave that is sampled by halves.
 _LEAST_SIDE, _CONTRAST_LOSS = 40, 0.75
 # Blur before derivatives, px of the stack.
@@ -78,6 +76,7 @@ class DiffusedScaleSpace(eqx.Module):
         scheme: of integration.
         conductivity: where the diffusion stops.
         percentile: of the picture's gradients, which divides edges from noise.
+        reach: of derivatives, blurs; half of a keypoint's size.
 
     References:
         Alcantarilla, Bartoli, Davison, "KAZE features", ECCV 2012, section 2; Alcantarilla, Nuevo, Bartoli, "Fast
@@ -91,6 +90,20 @@ class DiffusedScaleSpace(eqx.Module):
     scheme: Scheme = Splitting()
     conductivity: Conductivity = PeronaMalik()
     percentile: float = eqx.field(static=True, default=70.0)
+    reach: float = eqx.field(static=True, default=1.0)
+
+    @classmethod
+    def accelerated(cls, octaves: int = 4) -> "DiffusedScaleSpace":
+        """That of A-KAZE.
+
+        Args:
+            octaves: most octaves.
+
+        Example:
+            >>> DiffusedScaleSpace.accelerated().reach
+            1.5
+        """
+        return cls(octaves, halved=True, scheme=ExplicitCycle(), reach=1.5)
 
     def stacks(self, shape: tuple[int, ...]) -> tuple[int, int]:
         """How many stacks of layers there are, and in how many layers of one the extrema lie."""
@@ -110,7 +123,7 @@ class Stack(eqx.Module):
         layers: the diffused picture, grey levels.
         right: derivative along rows over the layer's reach, grey levels a pixel of the stack.
         down: along columns.
-        determinant: of the Hessian times the fourth power of 1.5 blurs, squared grey levels.
+        determinant: of the Hessian times the fourth power of the reach, squared grey levels.
         step: distance of two pixels of the stack, px of the picture.
     """
 
@@ -134,7 +147,7 @@ def stacks(image: Float[Array, "h w"], options: DiffusedScaleSpace) -> tuple[Sta
 
     Example:
         >>> import jax.numpy as jnp
-        >>> options = DiffusedScaleSpace(halved=True, scheme=ExplicitCycle())
+        >>> options = DiffusedScaleSpace.accelerated()
         >>> [(s.layers.shape, s.step) for s in stacks(jnp.ones((90, 80)), options)]
         [((6, 90, 80), 1.0), ((6, 45, 40), 2.0)]
     """
@@ -144,7 +157,7 @@ def stacks(image: Float[Array, "h w"], options: DiffusedScaleSpace) -> tuple[Sta
     blurs, base, found = options.blurs(count), smooth(image, options.sigma), []
     for k in range(number):
         layers = _diffused(base, edge, blurs, options)
-        found.append(Stack(layers, *_derivatives(layers, blurs), step=2.0**k))
+        found.append(Stack(layers, *_derivatives(layers, [options.reach * blur for blur in blurs]), step=2.0**k))
         if k + 1 < number:
             base, edge = halve(layers[options.layers]), _CONTRAST_LOSS * edge
     return tuple(found)
@@ -163,10 +176,10 @@ def _diffused(base: Array, edge: Array, blurs: tuple[float, ...], options: Diffu
     return jnp.concatenate([base[None], layers])
 
 
-def _derivatives(layers: Float[Array, "s h w"], blurs: tuple[float, ...]) -> tuple[Array, Array, Array]:
+def _derivatives(layers: Float[Array, "s h w"], wanted: list[float]) -> tuple[Array, Array, Array]:
     """First derivatives of all layers and their determinants, by Scharr's kernel spread over the layer's reach."""
     _, height, width = layers.shape
-    reaches = [max(1, round(REACH * blur)) for blur in blurs]
+    reaches = [max(1, round(reach)) for reach in wanted]
     margin = min(max(reaches), (min(height, width) - 1) // 2)
     reaches = [min(reach, margin) for reach in reaches]
 
@@ -181,7 +194,7 @@ def _derivatives(layers: Float[Array, "s h w"], blurs: tuple[float, ...]) -> tup
 
     # One program for all layers: it compiles faster than one a reach.
     # Responses of neighboring layers are alike when the reach before rounding makes them free of scale.
-    scales = jnp.asarray([(REACH * blur) ** 4 for blur in blurs], layers.dtype)
+    scales = jnp.asarray([reach**4 for reach in wanted], layers.dtype)
     return lax.map(of, (layers, jnp.asarray(reaches, jnp.int32), scales))
 
 
@@ -250,7 +263,7 @@ def seat_of(samples: Samples, uv: Array, sigma: Float[Array, " n"], options: Dif
     layer = jnp.round(level - (options.layers * stack).astype(level.dtype))
     layer = jnp.clip(layer, 0, several - 1).astype(jnp.int32)
     step = jnp.exp2(stack.astype(sigma.dtype))
-    return Seat(samples.start[stack, layer], samples.shape[stack], uv / step[:, None], REACH * sigma / step)
+    return Seat(samples.start[stack, layer], samples.shape[stack], uv / step[:, None], options.reach * sigma / step)
 
 
 def read(samples: Samples, seat: Seat, u: Float[Array, "n k"], v: Float[Array, "n k"]) -> tuple[Array, Array]:
