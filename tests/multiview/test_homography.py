@@ -6,7 +6,13 @@ import pytest
 
 import jaxloc as jl
 from jaxloc.images import Homography
-from jaxloc.multiview.homography import direct_linear_transform, estimate_homography, four_points, of_plane
+from jaxloc.multiview.homography import (
+    direct_linear_transform,
+    estimate_homography,
+    four_points,
+    of_plane,
+    transfer_error,
+)
 from jaxloc.poses import SE3, Direction
 
 MATRIX = np.array([[0.9, 0.1, 20.0], [-0.05, 1.1, -10.0], [2e-4, -1e-4, 1.0]])
@@ -136,6 +142,20 @@ def test_degenerate_sets_are_not_believed(dtype, kind):
     assert fit.value.homogeneous.dtype == dtype
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((fit, slope)))
     assert not bool(fit.ok) or kind == "random"
+
+
+def test_points_at_the_horizon_have_finite_derivatives():
+    """Their squares overflow: they count as gross errors, which nothing moves."""
+    matrix = jnp.array([[600.0, 0.0, 10.0], [0.0, 500.0, 20.0], [-1.0 / 300.0, 0.0, 1.0]])
+    first = jnp.array([[300.0 - 3e-5, 299.0, 10.0], [5.0, 5.0, 5.0]])
+
+    @jax.jit
+    @jax.value_and_grad
+    def cost(matrix):
+        return jnp.sum(transfer_error(matrix, first, jnp.zeros((2, 3)), 1.0, jnp.ones(3, bool)) ** 2)
+
+    value, slope = cost(matrix)
+    assert np.isfinite(value) and value >= 2e6 and np.isfinite(slope).all() and np.abs(slope).max() > 0
 
 
 def test_too_few_correspondences_are_told():

@@ -201,7 +201,9 @@ def transfer_error(
     # Written out, so that many hypotheses become one loop over the points.
     x, y, w = (row[0] * first[0] + row[1] * first[1] + row[2] for row in matrix)
     # The sign of the determinant is one: points of the plane that both cameras see have positive w.
-    ahead = valid & (w > float(jnp.finfo(w.dtype).eps))
+    # Nearer to the horizon rounding decides about it, and squares of where a point maps overflow.
+    parts = jnp.abs(matrix[2, 0] * first[0]) + jnp.abs(matrix[2, 1] * first[1]) + jnp.abs(matrix[2, 2])
+    ahead = valid & (w > float(jnp.finfo(w.dtype).eps) ** 0.5 * parts)
     inverse = 1.0 / jnp.where(ahead, w, 1.0)
     u, v = jnp.where(ahead, x, 0.0) * inverse, jnp.where(ahead, y, 0.0) * inverse
     by_x = [(matrix[0, i] - u * matrix[2, i]) * inverse for i in range(2)]

@@ -92,8 +92,15 @@ class Pair(eqx.Module):
         return Pair(self.image - offset, template, self.mask, self.by)
 
     def zero_mean(self) -> Float[Array, "m n"]:
-        """The template without its mean, twice: that of a bright template is rounded."""
-        once = self.centered(self.mean())
+        """The template without its mean, what rounding leaves of that included.
+
+        First without its brightest pixel, which is exact: the mean of a bright template is rounded, and not alike
+        wherever a compiler computes it anew.
+        """
+        counts = jnp.ones(self.template.shape, bool) if self.mask is None else self.mask > 0
+        brightest = jnp.max(self.template, where=counts, initial=jnp.min(self.template))
+        near = self.centered(lax.stop_gradient(brightest))
+        once = near.centered(near.mean())
         return once.centered(once.mean()).template
 
     def mean(self) -> Float[Array, ""]:
