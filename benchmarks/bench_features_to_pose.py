@@ -146,7 +146,7 @@ def _pallet(count: int, repeats: int) -> Iterator[Metric]:
     took = quickest(lambda: detect(image), repeats)
     yield Metric("features_to_pose.pallet.three_kinds", 1e3 * took.wall, "ms", "lower", TIME)
     total = lambda image: jnp.sum(detect_pallet(image, camera, kinds).estimate.value.translation)  # noqa: E731
-    yield gradient_over_forward("features_to_pose.pallet", total, (image,), took, repeats)
+    yield gradient_over_forward("features_to_pose.pallet", total, (image.astype(jnp.float32),), took, repeats)
     if repeats > 1:
         alone = eqx.filter_jit(lambda image: find_pallet(image, camera, kinds[:1]))
         took = quickest(lambda: alone(image), repeats)
