@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.ndimage
 
 from jaxloc.alignment.tracker import Klt, prepare, track, track_frames, track_sequence
 from jaxloc.alignment.tracker.frames import relative_gain
@@ -104,13 +105,16 @@ def test_guess_and_way_back(rng):
 
 
 def test_regression_is_the_least_squares_fit(rng, x64):
-    template, window = rng.normal(size=(9, 9, 1)), rng.normal(size=(8, 8, 1))
+    source, window, (right, down) = rng.normal(size=(10, 10)), rng.normal(size=(8, 8)), (0.3, 0.6)
+    v, u = np.mgrid[:9, :9]
+    template = scipy.ndimage.map_coordinates(source, [v + down, u + right], order=1)
     window = window + 3 * template[:8, :8]
-    step, gain = regress(sum_patches(*map(jnp.asarray, (template, window))), jnp.zeros((2, 1)), jnp.array([0.0, 99.0]))
-    inner = template[1:-1, 1:-1, 0]
-    slopes = (template[1:-1, 2:, 0] - template[1:-1, :-2, 0]) / 2, (template[2:, 1:-1, 0] - template[:-2, 1:-1, 0]) / 2
+    sums = sum_patches(*(jnp.asarray(x)[..., None] for x in (source, np.array([right, down]), window)))
+    step, gain = regress(sums, jnp.zeros((2, 1)), jnp.array([0.0, 99.0]))
+    inner = template[1:-1, 1:-1]
+    slopes = (template[1:-1, 2:] - template[1:-1, :-2]) / 2, (template[2:, 1:-1] - template[:-2, 1:-1]) / 2
     design = np.stack([*(x.ravel() for x in (*slopes, inner)), np.ones(49)], axis=1)
-    want = np.linalg.lstsq(design, window[:7, :7, 0].ravel(), rcond=None)[0]
+    want = np.linalg.lstsq(design, window[:7, :7].ravel(), rcond=None)[0]
     np.testing.assert_allclose(gain[0], want[2], rtol=1e-9)
     np.testing.assert_allclose(step[:, 0], want[:2] / want[2], rtol=1e-9)
 

@@ -11,10 +11,10 @@ from jaxloc.alignment.tracker.search import Found
 from jaxloc.alignment.tracker.sums import (
     PatchSums,
     at_fraction,
-    cut_template,
     cut_window,
     determinant_of,
     regress,
+    shift,
     split_pixel,
     sum_patches,
 )
@@ -68,29 +68,29 @@ def conclude(
 
 
 @jax.custom_jvp
-def _keep_sums(template, window, sums: PatchSums) -> PatchSums:
+def _keep_sums(source, below, window, sums: PatchSums) -> PatchSums:
     """The sums of the search, with the derivatives that summing the patches again has: only gradients pay for it."""
     return sums
 
 
 @_keep_sums.defjvp
 def _differentiate_sums(primals, tangents):
-    return primals[2], jax.jvp(sum_patches, primals[:2], tangents[:2])[1]
+    return primals[3], jax.jvp(sum_patches, primals[:3], tangents[:3])[1]
 
 
 def _conclude_some(previous: Frame, current: Frame, points, found: Found, usable, gains, options: Klt) -> Tracked:
     half, dtype, pixels = options.size // 2, previous.atlas.dtype, options.size**2
     at, below = split_pixel(points - (half + 1))
     usable = usable & _finite(previous, at, options.size + 3) & _finite(current, found.cell, options.size + 1)
-    template = cut_template(previous.atlas, at + previous.margin, below.astype(dtype), options.size)
+    source = cut_window(previous.atlas, at + previous.margin, options.size + 2)
     window = cut_window(current.atlas, found.cell + current.margin, options.size)
     kept = PatchSums(found.gram.T.reshape(3, 3, -1), found.cross.T.reshape(2, 2, 3, -1))
-    sums = _keep_sums(template, window, kept)
+    sums = _keep_sums(source, below.T.astype(dtype), window, kept)
     fraction, settled = _newton(sums, found.fraction.T, gains)
     step, gain = regress(sums, fraction, gains)
     settled = settled & (jnp.max(jnp.abs(step), axis=0) < 0.05)
     settled = settled & (jnp.max(jnp.abs(fraction - 0.5), axis=0) < 0.6)
-    patch = _shift(window, fraction)
+    patch = shift(window, fraction)
     energy = jnp.maximum(jnp.sum(patch * patch, axis=(0, 1)) - jnp.sum(patch, axis=(0, 1)) ** 2 / pixels, 0.0)
     contrast, product = sums.gram[2, 2], at_fraction(sums, fraction)[2]
     squares = jnp.maximum(energy - 2.0 * gain * product + gain * gain * contrast, 0.0)
@@ -135,12 +135,6 @@ def _newton_step(sums: PatchSums, frozen: PatchSums, fraction, gains):
     return fraction - jnp.where(small[None], moved, 0.0), near & small
 
 
-def _shift(window, fraction):
-    right, down = fraction[None, None, 0], fraction[None, None, 1]
-    mixed = (1.0 - down) * window[:-1] + down * window[1:]
-    return (1.0 - right) * mixed[:, :-1] + right * mixed[:, 1:]
-
-
 def _kept_noise(fraction):
     """Share of the pixels' noise variance that bilinear interpolation lets through: the sum of squared weights."""
     return jnp.prod((1.0 - fraction) ** 2 + fraction**2, axis=1)
@@ -153,7 +147,7 @@ def _finite(frame: Frame, corner, size: int):
         bad = jnp.where(frame.finite, 0.0, 1.0).astype(frame.atlas.dtype)
         return jnp.max(slice_windows(bad, corner + frame.margin, (size, size)), axis=(1, 2)) < 0.5
 
-    return lax.cond(jnp.all(frame.finite), lambda _: jnp.ones(corner.shape[0], dtype=bool), look, None)
+    return lax.cond(frame.clean, lambda _: jnp.ones(corner.shape[0], dtype=bool), look, None)
 
 
 def _covariance(sums: PatchSums, variance, ok, options: Klt):

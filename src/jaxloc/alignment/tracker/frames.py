@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxloc.images.pyramid import gaussian_pyramid
 
@@ -17,6 +17,7 @@ class Frame(eqx.Module):
         atlas: Every level with repeated border pixels, level 0 on top, all others side by side below it. Gradients pass
             through level 0 only.
         finite: Pixels of level 0, its border included, that are numbers.
+        clean: Whether all of them are.
         spread: Sorted sample of grey levels of a coarse level, to compare exposures.
         shape: Rows and columns of the image.
         levels: Number of pyramid levels.
@@ -25,17 +26,18 @@ class Frame(eqx.Module):
 
     atlas: Float[Array, "a b"]
     finite: Bool[Array, "c d"]
+    clean: Bool[Array, ""]
     spread: Float[Array, " s"]
     shape: tuple[int, int] = eqx.field(static=True)
     levels: int = eqx.field(static=True)
     margin: int = eqx.field(static=True)
 
 
-def build_frame(image: Float[Array, "h w"], levels: int, margin: int) -> Frame:
+def build_frame(image: Float[Array, "h w"] | UInt8[Array, "h w"], levels: int, margin: int) -> Frame:
     """Builds the pyramid and packs it; what is not a number becomes the mean of the others.
 
     Args:
-        image: Grey image.
+        image: Grey image; integers become float32.
         levels: Number of pyramid levels.
         margin: Pixels by which the border of every level is repeated.
 
@@ -48,16 +50,29 @@ def build_frame(image: Float[Array, "h w"], levels: int, margin: int) -> Frame:
         >>> frame.atlas.shape, frame.finite.shape
         ((84, 62), (52, 62))
     """
-    finite = jnp.isfinite(image)
-    mean = jnp.sum(jnp.where(finite, image, 0.0)) / jnp.maximum(jnp.sum(finite, dtype=jnp.int32), 1).astype(image.dtype)
-    clean = jnp.where(finite, image, lax.stop_gradient(mean))
-    pyramid = (clean, *gaussian_pyramid(lax.stop_gradient(clean), levels=levels)[1:])
+    grey, finite, clean = _clean(image)
+    pyramid = (grey, *gaussian_pyramid(lax.stop_gradient(grey), levels=levels)[1:])
     padded = [jnp.pad(level, margin, mode="edge") for level in pyramid]
-    height, width = _atlas_shape(image.shape, levels, margin)
-    atlas = jnp.zeros((height, width), dtype=image.dtype)
+    atlas = jnp.zeros(_atlas_shape(image.shape, levels, margin), dtype=grey.dtype)
     for level, corner in zip(padded, _corners(image.shape, levels, margin), strict=True):
         atlas = lax.dynamic_update_slice(atlas, level, (corner[1], corner[0]))
-    return Frame(atlas, jnp.pad(finite, margin, mode="edge"), _spread(pyramid), image.shape, levels, margin)
+    return Frame(atlas, jnp.pad(finite, margin, mode="edge"), clean, _spread(pyramid), image.shape, levels, margin)
+
+
+def _clean(image: Float[Array, "h w"] | UInt8[Array, "h w"]):
+    """The image as numbers, which of its pixels were numbers, and whether all of them were."""
+    if not jnp.issubdtype(image.dtype, jnp.floating):
+        return image.astype(jnp.float32), jnp.ones(image.shape, dtype=bool), jnp.array(True)
+    finite = jnp.isfinite(image)
+    # One sum tells, unless it overflows; then every pixel is looked at.
+    clean = jnp.isfinite(jnp.sum(image))
+
+    def mean_of_finite(_):
+        count = jnp.maximum(jnp.sum(finite, dtype=jnp.int32), 1).astype(image.dtype)
+        return jnp.sum(jnp.where(finite, image, 0.0)) / count
+
+    mean = lax.cond(clean, lambda _: jnp.zeros((), dtype=image.dtype), mean_of_finite, None)
+    return jnp.where(finite, image, lax.stop_gradient(mean)), finite, clean
 
 
 def level_corners(frame: Frame) -> Int[Array, "l 2"]:

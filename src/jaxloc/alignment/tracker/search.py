@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxloc.alignment.tracker.frames import Frame, level_corners, level_sizes
 from jaxloc.alignment.tracker.records import Klt
-from jaxloc.alignment.tracker.sums import cut_template, cut_window, solve_cell, split_pixel, sum_patches
+from jaxloc.alignment.tracker.sums import cut_window, solve_cell, split_pixel, sum_patches
 
 
 class Found(eqx.Module):
@@ -133,12 +133,12 @@ def _round(previous, current, uv, offset, gains, corner, size, level, options: K
     uv = jnp.clip(uv, 0.0, last)
     half = options.size // 2
     # The border is repeated, so that points may lie anywhere on the level.
-    at, fraction = split_pixel(uv - (half + 1))
-    template = cut_template(previous, at + corner, fraction.astype(dtype), options.size)
+    at, below = split_pixel(uv - (half + 1))
+    source = cut_window(previous, at + corner, options.size + 2)
     target = jnp.clip(uv + offset, 0.0, last)
     cell, fraction = split_pixel(target - half)
     window = cut_window(current, cell + corner, options.size)
-    sums = sum_patches(template, window)
+    sums = sum_patches(source, below.T.astype(dtype), window)
     solution = solve_cell(sums, fraction.T.astype(dtype), gains, options.num_steps)
     beyond = jnp.max(jnp.abs(solution.fraction - 0.5), axis=0) - 0.5
     # What is just beyond its cell on a coarse level is near enough for the next.

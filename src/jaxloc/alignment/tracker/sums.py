@@ -39,23 +39,6 @@ class CellSolution(eqx.Module):
     regular: Bool[Array, " n"]
 
 
-def cut_template(
-    image: Float[Array, "h w"], corner: Int[Array, "n 2"], fraction: Float[Array, "n 2"], size: int
-) -> Float[Array, "p p n"]:
-    """Cuts `size + 2` square patches at a fraction of a pixel, points along the last axis, center pixel near zero.
-
-    Example:
-        >>> import jax.numpy as jnp
-        >>> image = jnp.arange(36.0).reshape(6, 6)
-        >>> cut_template(image, jnp.array([[0, 0]]), jnp.array([[0.5, 0.0]]), 3)[2, :, 0].tolist()
-        [-8.5, -7.5, -6.5, -5.5, -4.5]
-    """
-    windows = cut_window(image, corner, size + 2)
-    right, down = fraction[None, None, :, 0], fraction[None, None, :, 1]
-    mixed = (1.0 - down) * windows[:-1] + down * windows[1:]
-    return (1.0 - right) * mixed[:, :-1] + right * mixed[:, 1:]
-
-
 def cut_window(image: Float[Array, "h w"], corner: Int[Array, "n 2"], size: int) -> Float[Array, "p p n"]:
     """Cuts `size + 1` square windows, points along the last axis, each relative to its center pixel.
 
@@ -70,59 +53,60 @@ def cut_window(image: Float[Array, "h w"], corner: Int[Array, "n 2"], size: int)
     return jnp.transpose(windows - center[:, None, None], (1, 2, 0))
 
 
-def sum_patches(template: Float[Array, "p p n"], window: Float[Array, "q q n"]) -> PatchSums:
+def sum_patches(
+    source: Float[Array, "r r n"], fraction: Float[Array, "2 n"], window: Float[Array, "q q n"]
+) -> PatchSums:
     """Sums over all pixels of each patch, one row at a time so that everything stays in the cache.
 
     Args:
-        template: Patches with one pixel more on every side, points last.
-        window: Windows with one pixel more to the right and below.
+        source: Windows of the first image with one pixel more to the left and above, two to the right and below.
+        fraction: How far (right, down) the templates lie from the source's pixels.
+        window: Windows of the second image with one pixel more to the right and below.
 
     Returns:
         Sums of products of template and window, both freed of their means.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> ramp = jnp.broadcast_to(jnp.arange(5.0)[None, :, None], (5, 5, 1))
-        >>> sums = sum_patches(ramp, ramp[:4, :4])
+        >>> ramp = jnp.broadcast_to(jnp.arange(6.0)[None, :, None], (6, 6, 1))
+        >>> sums = sum_patches(ramp, jnp.zeros((2, 1)), ramp[:4, :4])
         >>> float(sums.gram[2, 2, 0]), float(sums.cross[0, 1, 2, 0])
         (6.0, 6.0)
     """
     size, count = window.shape[0] - 1, window.shape[2]
+    # XLA's CPU compiler drops barriers and would interpolate anew for every product; into a branch it does not look.
+    apart = fraction[0, 0] < 2.0
+    template = lax.cond(apart, shift, lambda pixels, _: jnp.zeros_like(pixels[1:, 1:]), source, fraction)
     inner = template[1:-1, 1:-1]
-    right, down = 0.5 * (template[1:-1, 2:] - template[1:-1, :-2]), 0.5 * (template[2:, 1:-1] - template[:-2, 1:-1])
-    # The fourth map, of ones, gives the sums that free all others of their means.
-    maps = jnp.stack([right, down, inner, jnp.ones_like(inner)], axis=2)
+    slopes = 0.5 * (template[1:-1, 2:] - template[1:-1, :-2]), 0.5 * (template[2:, 1:-1] - template[:-2, 1:-1])
+    # The last map, of ones, gives the sums that free all others of their means.
+    maps = jnp.stack([*slopes, inner, jnp.ones_like(inner)], axis=2)
 
     def add_row(row, sums):
-        squares, products, pair, cross = sums
         line = lax.dynamic_index_in_dim(maps, row, 0, keepdims=False)
         near = lax.dynamic_slice(window, (row, 0, 0), (2, size + 1, count))
-        squares = squares + sum(line[k, :3] * line[k, :3] for k in range(size))
-        products = products + sum(line[k, :3] * line[k, 1:] for k in range(size))
-        pair = pair + sum(line[k, :2] * line[k, 2:] for k in range(size))
-        return (
-            squares,
-            products,
-            pair,
-            tuple(
-                x + sum(line[k] * near[i, k + j][None] for k in range(size))
-                for x, (i, j) in zip(cross, ((0, 0), (0, 1), (1, 0), (1, 1)), strict=True)
-            ),
-        )
+        gram, *cross = sums
+        gram = gram + sum(line[k, :3, None] * line[k, None] for k in range(size))
+        return gram, *(x + sum(near[:, k + j, None] * line[None, k] for k in range(size)) for j, x in enumerate(cross))
 
-    def zeros(rows):
-        return jnp.zeros((rows, count), dtype=window.dtype)
+    zeros = tuple(jnp.zeros((*shape, count), dtype=window.dtype) for shape in ((3, 4), (2, 4), (2, 4)))
+    gram, *cross = lax.fori_loop(0, size, add_row, zeros)
+    total, cross = gram[:, 3], jnp.stack(cross, axis=1)
+    mean = total / float(size * size)
+    return PatchSums(gram[:, :3] - total[:, None] * mean[None], cross[:, :, :3] - mean[None, None] * cross[:, :, 3:])
 
-    # squares: uu, vv, tt; products: uv, vt, t; pair: ut, v; and u by its own sum below.
-    start = zeros(3), zeros(3), zeros(2), (zeros(4),) * 4
-    squares, products, pair, cross = lax.fori_loop(0, size, add_row, start)
-    total = jnp.stack([jnp.sum(right, axis=(0, 1)), pair[1], products[2]])
-    gram = jnp.stack([squares[0], products[0], pair[0], products[0], squares[1], products[1]])
-    gram = jnp.concatenate([gram, jnp.stack([pair[0], products[1], squares[2]])]).reshape(3, 3, count)
-    pixels = float(size * size)
-    gram = gram - total[:, None] * total[None] / pixels
-    centered = [x[:3] - total * x[3:] / pixels for x in cross]
-    return PatchSums(gram, jnp.stack(centered).reshape(2, 2, 3, count))
+
+def shift(pixels: Float[Array, "p q n"], fraction: Float[Array, "2 n"]) -> Float[Array, "p2 q2 n"]:
+    """Shifts each patch by its fraction (right, down) of a pixel, bilinearly; it loses its last row and column.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> shift(jnp.arange(4.0).reshape(2, 2, 1), jnp.array([[0.5], [0.0]])).tolist()
+        [[[0.5]]]
+    """
+    right, down = fraction[:, None, None]
+    mixed = (1.0 - down) * pixels[:-1] + down * pixels[1:]
+    return (1.0 - right) * mixed[:, :-1] + right * mixed[:, 1:]
 
 
 def regress(
@@ -143,8 +127,8 @@ def regress(
 
     Example:
         >>> import jax.numpy as jnp
-        >>> ramp = jnp.broadcast_to(jnp.arange(5.0)[None, :, None] ** 2, (5, 5, 1))
-        >>> sums = sum_patches(ramp, 0.5 * ramp[:4, :4])
+        >>> ramp = jnp.broadcast_to(jnp.arange(6.0)[None, :, None] ** 2, (6, 6, 1))
+        >>> sums = sum_patches(ramp, jnp.zeros((2, 1)), 0.5 * ramp[:4, :4])
         >>> bool(jnp.isfinite(regress(sums, jnp.zeros((2, 1)), jnp.array([0.1, 9.0]))[0]).all())
         True
     """

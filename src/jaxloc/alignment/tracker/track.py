@@ -33,11 +33,10 @@ def prepare(image: Float[Array, "h w"] | UInt8[Array, "h w"], *, options: Klt = 
     """
     if min(image.shape) < options.size:
         raise ValueError(f"prepare: a patch of {options.size} px does not fit an image of shape {image.shape}.")
-    grey = image if jnp.issubdtype(image.dtype, jnp.floating) else image.astype(jnp.float32)
     levels = options.levels
     while levels > 1 and min(image.shape) >> (levels - 1) < max(options.size // 2, 4):
         levels -= 1
-    return build_frame(grey, levels, options.size // 2 + 2)
+    return build_frame(image, levels, options.size // 2 + 2)
 
 
 @eqx.filter_jit
