@@ -3,6 +3,7 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from jaxloc.images.apart import apart
 from jaxloc.images.gradients import pad_reflected
 
 _BINOMIAL = (1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0)
@@ -28,10 +29,7 @@ def halve(image: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
         >>> halve(jnp.ones((7, 10))).shape
         (4, 5)
     """
-    height, width = image.shape
-    padded = pad_reflected(image, (2, 2))
-    rows = sum(weight * padded[k : k + height : 2] for k, weight in enumerate(_BINOMIAL))
-    return sum(weight * rows[:, k : k + width : 2] for k, weight in enumerate(_BINOMIAL))
+    return apart(_halve_columns, apart(_halve_rows, image))
 
 
 @eqx.filter_jit
@@ -86,3 +84,13 @@ def from_level(uv: Float[Array, "n 2"], level: int) -> Float[Array, "n 2"]:
         [[8.0, 6.0]]
     """
     return uv * 2.0**level
+
+
+def _halve_rows(image: Float[Array, "h w"]) -> Float[Array, "h2 w"]:
+    padded = pad_reflected(image, (2, 0))
+    return sum(weight * padded[k : k + image.shape[0] : 2] for k, weight in enumerate(_BINOMIAL))
+
+
+def _halve_columns(image: Float[Array, "h w"]) -> Float[Array, "h w2"]:
+    padded = pad_reflected(image, (0, 2))
+    return sum(weight * padded[:, k : k + image.shape[1] : 2] for k, weight in enumerate(_BINOMIAL))

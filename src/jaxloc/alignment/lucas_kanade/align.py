@@ -67,7 +67,9 @@ def align(
         >>> bool(fit.ok), [round(x, 1) for x in fit.value.translation.tolist()]
         (True, [12.3, 9.6])
     """
-    return _align(take(image, template, weights, sigma, method), start_of(warp, initial, template))
+    # Numbers become arrays here, so that no value is compiled in; all else happens in one program.
+    arrays = (None if given is None else jnp.asarray(given) for given in (image, template, weights, sigma))
+    return _align(*arrays, warp, initial, method)
 
 
 def take(image: Any, template: Any, weights: Any, sigma: Any, method: LucasKanade) -> Evidence:
@@ -93,8 +95,11 @@ def start_of(warp: type[Warp], initial: Warp | None, template: Any) -> Warp:
 
 
 @eqx.filter_jit
-def _align(evidence: Evidence, start: Warp) -> Estimate:
-    start, finite = finite_start(start)
+def _align(
+    image: Any, template: Any, weights: Any, sigma: Any, warp: type[Warp], initial: Any, method: Any
+) -> Estimate:
+    evidence = take(image, template, weights, sigma, method)
+    start, finite = finite_start(start_of(warp, initial, template))
     detached = jax.lax.stop_gradient(evidence)
     levels = detached.levels()
     found = search(detached, levels, evidence.frame.normalize(start), zero_brightness(levels[0]))

@@ -18,6 +18,7 @@ from jaxloc.alignment.lucas_kanade.level import Frame, Level
 from jaxloc.alignment.lucas_kanade.noise import passage
 from jaxloc.alignment.lucas_kanade.scales import Scaled
 from jaxloc.alignment.lucas_kanade.settings import LucasKanade
+from jaxloc.images.apart import apart
 from jaxloc.images.warps import Warp
 from jaxloc.poses.group import matmul
 from jaxloc.solvers.estimate import Status
@@ -101,7 +102,7 @@ def slope(level: Level, warp: Warp, brightness: Float[Array, " k"], matching: Ma
     projected = steepest - matmul(sums.leaks.T, columns)
     left = weighted.difference - matmul(sums.coefficients, columns)
     seen = level.look_around(warp, matching.interpolation)
-    along = through(warp, level, seen.slope)
+    along = apart(lambda slope: through(warp, level, slope), seen.slope)
     right, down = warp.jacobian_components(level.u, level.v)
     change = along[0][None] * right + along[1][None] * down
     weight = weighted.weight + left * weight_slope(level, weighted, matching)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc.alignment.lucas_kanade.brightness import Brightness
 from jaxloc.alignment.lucas_kanade.scales import Scaled
+from jaxloc.images.apart import apart
 from jaxloc.images.interpolation import AbstractInterpolation, sample_components
 from jaxloc.images.warps import Homography, Similarity, Warp
 
@@ -110,7 +111,7 @@ class Level(eqx.Module):
         known = known & jnp.isfinite(weight) & (weight > 0)
         weight = jnp.where(known, weight, 0.0).reshape(-1)
         values = jnp.where(known, template, 0.0).reshape(-1)
-        slope = jnp.where(known[None], slope, 0.0).reshape(2, -1)
+        slope = apart(lambda slope: jnp.where(known[None], slope, 0.0).reshape(2, -1), slope)
         standard, spread = _standardize(values, weight)
         channels = None
         if differentiate_image:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc.images.apart import apart
 from jaxloc.images.patches import slice_windows
 
 
@@ -74,9 +75,7 @@ def sum_patches(
         (6.0, 6.0)
     """
     size, count = window.shape[0] - 1, window.shape[2]
-    # XLA's CPU compiler drops barriers and would interpolate anew for every product; into a branch it does not look.
-    apart = fraction[0, 0] < 2.0
-    template = lax.cond(apart, shift, lambda pixels, _: jnp.zeros_like(pixels[1:, 1:]), source, fraction)
+    template = apart(shift, source, fraction)
     inner = template[1:-1, 1:-1]
     slopes = 0.5 * (template[1:-1, 2:] - template[1:-1, :-2]), 0.5 * (template[2:, 1:-1] - template[:-2, 1:-1])
     # The last map, of ones, gives the sums that free all others of their means.
