@@ -75,6 +75,21 @@ def test_aligns_where_squares_and_ecc_fail(rng, warp, name):  # K-22, R-36
             assert ecc > 1.0 and squares > 2.0
 
 
+@pytest.mark.parametrize("warp", WARPS)
+def test_covariance_is_cautious(rng, warp):
+    start, truth = Translation(jnp.asarray(START, jnp.float32)), warp.from_matrix(jnp.asarray(WARPS[warp], jnp.float32))
+    many = jax.jit(jax.vmap(lambda *pair: align(*pair, warp, start)))
+    for name in ("astronaut", "gravel"):
+        scene, count = real_scene(name), 10
+        image = 255 - scene + 6 * rng.normal(size=(count, *scene.shape))
+        template = seen(scene, WARPS[warp]) + 6 * rng.normal(size=(count, ROWS, COLUMNS))
+        found = many(jnp.asarray(image, jnp.float32), jnp.asarray(template, jnp.float32))
+        error = np.asarray(jax.vmap(lambda value: (value.inverse() @ truth).log())(found.value))
+        nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(np.asarray(found.covariance)), error) / truth.dof
+        assert bool(found.ok.all())
+        assert 0.1 < nees.mean() < 1.7
+
+
 def test_equals_a_fine_histogram(rng):
     a = rng.integers(0, 6, (200, 200)).astype(float)
     b = (a + rng.integers(0, 2, a.shape)) % 6

@@ -31,6 +31,8 @@ class MutualInformation(eqx.Module):
         tolerance: length of a step that counts as none, px.
         min_coverage: least part of the template that must lie on the image.
         min_information: least mutual information of a trusted result, nats.
+        least_sigma: error of a pixel's place that noise does not show, px: interpolation favors places between pixels,
+            and smoothing a picture is not smoothing what another camera makes of it.
     """
 
     bins: int = eqx.field(static=True, default=32)
@@ -39,6 +41,7 @@ class MutualInformation(eqx.Module):
     tolerance: float = eqx.field(static=True, default=2e-3)
     min_coverage: float = eqx.field(static=True, default=0.5)
     min_information: float = eqx.field(static=True, default=0.1)
+    least_sigma: float = eqx.field(static=True, default=0.03)
 
 
 def align(
@@ -66,9 +69,11 @@ def align(
     Returns:
         Estimate of the warp; `cost` is minus the mutual information, nats. With n pixels on the image, n times the
         mutual information is the gain in log-likelihood of the (estimated) joint density over independence, if pixels
-        were independent; `information` is minus its Hessian, and the covariance (of ``W @ exp(d)``) the inverse. It is
-        rough: blur and interpolation make pixels dependent. `ok` is False if the texture leaves a direction
-        undetermined, the search did not settle, too little of the template lies on the image, or too little is told.
+        were independent; `information` is minus its Hessian. The covariance (of ``W @ exp(d)``) is the inverse, and
+        `least_sigma` in the mean over the template. It is cautious, not exact: blur and interpolation make pixels
+        dependent and pull the maximum aside by some hundredths of a pixel. `ok` is False if the texture leaves a
+        direction undetermined, the search did not settle, too little of the template lies on the image, or too little
+        is told.
 
     Raises:
         ValueError: a picture has not two axes, the mask has another shape, or there are too few bins.
@@ -280,7 +285,16 @@ def _conclude(scale: _Scale, warp: Warp, moved: Array, count: Array, finite: Arr
     value = scale.frame.denormalize(warp.retract(jnp.where(ok, step, 0.0)))
     to_pixels = scale.frame.tangent_to_pixels(warp.dof, zero.dtype)
     pixels = jnp.maximum(covered, 1.0)
-    covariance = matmul(to_pixels, matmul(jnp.where(regular, inverse / pixels, eye), to_pixels.T))
+    spread = inverse / pixels + _hidden(frozen, warp, method)
+    covariance = matmul(to_pixels, matmul(jnp.where(regular, spread, eye), to_pixels.T))
     from_pixels = jnp.linalg.inv(to_pixels)
     information = matmul(from_pixels.T, matmul(jnp.where(regular, curvature * pixels, 0.0 * eye), from_pixels))
     return Estimate(value, lax.stop_gradient(covariance), cost, ok, count, status, lax.stop_gradient(information))
+
+
+def _hidden(scale: _Scale, warp: Warp, method: MutualInformation) -> Float[Array, "d d"]:
+    """Covariance of a warp that moves the template's pixels by `least_sigma` in the mean, by each way of it alike."""
+    zero = jnp.zeros(warp.dof, scale.u.dtype)
+    ways = jnp.concatenate(jax.jacfwd(lambda delta: _moved(scale, warp, delta))(zero)) * scale.frame.radius
+    mean = matmul(ways.T, ways) / float(scale.u.shape[0])
+    return jnp.linalg.inv(mean) * (method.least_sigma**2 * 2.0 / warp.dof)
