@@ -14,8 +14,16 @@ from benchmarks.metric import ACCURACY, TIME, Metric, quickest
 from jaxloc.data.landmarks import LandmarkLog, read_factors, read_mrclam, read_ranging
 from jaxloc.data.simulate.landmarks import simulate_landmarks
 from jaxloc.filters import ExtendedKalmanFilter, SigmaPointFilter, run
-from jaxloc.filters.rao_blackwell import FastSlam, FromMotion, FromReading
-from jaxloc.sensors import IncrementMotion, RangeBearingSensor, RangeSensor, RangingMotion, RangingState
+from jaxloc.filters.rao_blackwell import Appearance, DescriptorFastSlam, FastSlam, FromBlock, FromMotion, FromReading
+from jaxloc.sensors import (
+    DescribedReading,
+    IncrementMotion,
+    RangeBearing,
+    RangeBearingSensor,
+    RangeSensor,
+    RangingMotion,
+    RangingState,
+)
 from jaxloc.sensors.landmarks import confusion
 from jaxloc.slam.ekf_slam import EkfSlam
 
@@ -24,6 +32,12 @@ _MRCLAM_CLOCK = 1248272272.94  # stamp of time zero of the motion capture, from 
 _DELAYS = np.arange(0.0, 0.45, 0.05)  # s, from a command of the robot to its effect
 _DEVIATIONS = (0.1, 0.03)
 _GATE = 0.999
+_PROPOSALS = (
+    ("fast_slam_1", FromMotion()),
+    ("fast_slam_2", FromReading()),
+    ("fast_slam_of_blocks", FromBlock(200)),
+)
+_KINDS, _LOOKS = 5, 8  # how many landmarks look different, and numbers of a descriptor
 
 
 def metrics(smoke: bool) -> Iterator[Metric]:
@@ -60,7 +74,7 @@ def _simulated(runs: int, steps: int) -> Iterator[Metric]:
     yield Metric("landmarks.ekf_slam.us_a_step", 1e6 * spent / steps, "us", "lower", TIME)
     ours = float(np.sqrt(errors.mean()))
     yield Metric("landmarks.ekf_slam.landmark_rmse", ours, "m", "lower", ACCURACY)
-    for name, proposal in (("fast_slam_1", FromMotion()), ("fast_slam_2", FromReading())):
+    for name, proposal in _PROPOSALS:
         particles = FastSlam(motion, *_DEVIATIONS, num_particles=100, capacity=20, proposal=proposal)
 
         def follow(world, key, particles=particles):
@@ -68,8 +82,44 @@ def _simulated(runs: int, steps: int) -> Iterator[Metric]:
             end = run(particles, particles.init(prior), *drive, keep=_nothing, key=key)[0]
             return _squared(_mean_map(end), world.landmarks)
 
-        error = float(np.sqrt(jax.jit(jax.vmap(follow))(worlds, keys).mean()))
+        error = float(np.sqrt(_each(follow, worlds, keys).mean()))
         yield Metric(f"landmarks.{name}.landmark_rmse_over_ekf_slam", error / ours, "x", "lower", ACCURACY)
+    yield from _look_alikes(motion, prior, worlds, keys)
+
+
+def _look_alikes(motion: IncrementMotion, prior: jl.beliefs.Gaussian, worlds: Any, keys: Any) -> Iterator[Metric]:
+    """Numbers hidden, five kinds of looks among 20 landmarks: maps beside those with numbers."""
+    slam = FastSlam(motion, *_DEVIATIONS, num_particles=100, capacity=30)
+    looks = DescriptorFastSlam(slam, Appearance(0.3), length=_LOOKS)
+
+    def numbered(world, key):
+        end = run(slam, slam.init(prior), world.increments, world.readings, world.valid, keep=_nothing, key=key)[0]
+        return _nearest(end, world)
+
+    def described(world, key):
+        number = world.readings.landmark
+        noise = 0.1 * jax.random.normal(jax.random.fold_in(key, 1), (len(world.valid), _LOOKS))
+        descriptors = jnp.eye(_KINDS, _LOOKS)[number % _KINDS] + noise
+        hidden = jax.vmap(RangeBearing)(world.readings.range, world.readings.bearing, -jnp.ones_like(number))
+        drive = (world.increments, jax.vmap(DescribedReading)(hidden, descriptors), world.valid)
+        return _nearest(run(looks, looks.init(prior), *drive, keep=_nothing, key=key)[0].slam, world)
+
+    hidden, rows = _each(described, worlds, keys)
+    ratio = float(np.sqrt(hidden.mean() / _each(numbered, worlds, keys)[0].mean()))
+    yield Metric("landmarks.fast_slam_by_looks.landmark_rmse_over_numbered", ratio, "x", "lower", ACCURACY)
+    yield Metric("landmarks.fast_slam_by_looks.rows", float(rows.mean()), "of 20", "equal", ACCURACY)
+
+
+def _nearest(end: Any, world: Any) -> tuple[Any, Any]:
+    """Mean squared distance of the landmarks to the nearest rows of the best map, and how many rows it has."""
+    known = jax.tree.map(lambda leaf: leaf[end.best()], end.maps)
+    squared = jnp.sum((world.landmarks[:, None] - known.means[None]) ** 2, axis=-1)
+    return jnp.mean(jnp.min(jnp.where(known.seen[None], squared, jnp.inf), axis=1)), jnp.sum(known.seen)
+
+
+def _each(follow: Any, *stacked: Any) -> Any:
+    """One by one, so that what is done now and then (a `FromBlock` draws) costs nothing in between."""
+    return jax.jit(lambda *items: jax.lax.map(lambda one: follow(*one), items))(*stacked)
 
 
 def _mrclam() -> Iterator[Metric]:
@@ -123,13 +173,13 @@ def _mrclam_slam(log: LandmarkLog, motion: IncrementMotion) -> Iterator[Metric]:
     ekf = _map_errors(end.landmarks, log.landmarks, seen_well)
     yield Metric("landmarks.mrclam.ekf_slam_landmark_rmse", ekf[0], "m", "lower", ACCURACY)
     yield Metric("landmarks.mrclam.ekf_slam_landmark_rmse_aligned", ekf[1], "m", "lower", ACCURACY)
-    for name, proposal in (("fast_slam_1", FromMotion()), ("fast_slam_2", FromReading())):
+    for name, proposal in _PROPOSALS:
         particles = FastSlam(motion, *_DEVIATIONS, num_particles=100, capacity=len(log.names), proposal=proposal)
 
         def follow(key, particles=particles):
             return _mean_map(run(particles, particles.init(prior), *drive, keep=_nothing, key=key)[0])
 
-        maps = jax.jit(jax.vmap(follow))(jax.random.split(jax.random.key(0), 20))
+        maps = _each(follow, jax.random.split(jax.random.key(0), 20))
         errors = np.array([_map_errors(points, log.landmarks, seen_well) for points in maps])
         median = np.median(errors, axis=0)
         yield Metric(f"landmarks.mrclam.{name}_landmark_rmse", median[0], "m", "lower", ACCURACY)

@@ -35,11 +35,12 @@ from jaxloc.filters.motion import (
 from jaxloc.filters.parallel import run_parallel, smooth_parallel
 from jaxloc.filters.particle import ParticleFilter, ParticleInfo, ParticleState
 from jaxloc.filters.proposals import Auxiliary, Bootstrap, Guided
-from jaxloc.filters.rao_blackwell import FastSlam, FastSlamInfo, FastSlamState
+from jaxloc.filters.rao_blackwell import Appearance, DescriptorFastSlam, FastSlam, FastSlamInfo, FastSlamState
 from jaxloc.filters.smoothers import smooth, smooth_fixed_lag
 from jaxloc.filters.unscented import Cubature, GaussHermite, SigmaPointFilter, Unscented
 
 __all__ = [
+    "Appearance",
     "Auxiliary",
     "BodyTwist",
     "Bootstrap",
@@ -47,6 +48,7 @@ __all__ = [
     "ConstantVelocity",
     "CoordinatedTurn",
     "Cubature",
+    "DescriptorFastSlam",
     "ExtendedKalmanFilter",
     "FastSlam",
     "FastSlamInfo",

@@ -21,7 +21,7 @@ from jaxloc.sensors.ceiling import CeilingMosaic, CeilingSensor
 from jaxloc.sensors.distortion import BrownConrady, KannalaBrandt, Lens
 from jaxloc.sensors.ground import GroundCamera
 from jaxloc.sensors.increments import Increment, IncrementMotion
-from jaxloc.sensors.landmarks import RangeBearing, RangeBearingSensor
+from jaxloc.sensors.landmarks import DescribedReading, RangeBearing, RangeBearingSensor
 from jaxloc.sensors.lane import Lane
 from jaxloc.sensors.laser import BeamModel, LaserScan, LikelihoodField
 from jaxloc.sensors.maps import DistanceField, FreeSpace, OccupancyMap
@@ -36,6 +36,7 @@ __all__ = [
     "BrownConrady",
     "CeilingMosaic",
     "CeilingSensor",
+    "DescribedReading",
     "DifferentialDrive",
     "DistanceField",
     "FreeSpace",

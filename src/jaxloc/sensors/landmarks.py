@@ -28,6 +28,18 @@ class RangeBearing(eqx.Module):
     landmark: Int[Array, ""]
 
 
+class DescribedReading(eqx.Module):
+    """Where a landmark was seen, and what it looks like: the reading of a camera that finds SIFT features.
+
+    Attributes:
+        reading: range and bearing; ``landmark`` is -1 where only its looks say which one it was.
+        descriptor: "d" numbers that are alike whenever the landmark is the same.
+    """
+
+    reading: RangeBearing
+    descriptor: Float[Array, " d"]
+
+
 class RangeBearingSensor(Sensor):
     """Ranges and bearings of known landmarks from a planar pose; noise is independent in both.
 
