@@ -27,7 +27,7 @@ class Klt(eqx.Module):
     least_sigma: float = eqx.field(static=True, default=0.03)
     max_rounds: int = eqx.field(static=True, default=6)
     num_steps: int = eqx.field(static=True, default=5)
-    chunk: int = eqx.field(static=True, default=128)
+    chunk: int = eqx.field(static=True, default=64)
 
     def __check_init__(self):
         if self.size < 3 or self.size % 2 == 0:
