@@ -14,7 +14,7 @@ from benchmarks import baker_matthews as protocol
 from benchmarks.metric import ACCURACY, RATIO, REPOSITORY, TIME, Metric, quickest, timed
 from jaxloc.alignment import lucas_kanade as lk
 from jaxloc.alignment import multi_start
-from jaxloc.images import describe, detect, match
+from jaxloc.features import match, opencv
 from jaxloc.images.warps import Homography, Translation
 
 GRAF = REPOSITORY.parent / "shared" / "data" / "homography_graf"
@@ -202,9 +202,9 @@ def _covariance(count: int) -> Iterator[Metric]:
 def _graf(folder: Path) -> Iterator[Metric]:
     """Graffiti 1 to 3: features start, robust alignment ends."""
     first, third = (cv2.imread(str(folder / f"graf{i}.png"), cv2.IMREAD_GRAYSCALE) for i in (1, 3))
-    kind = detect.SIFT()
-    keypoints = [detect.detect(kind, image, 2000) for image in (first, third)]
-    described = [describe.describe(kind, image, each) for image, each in zip((first, third), keypoints, strict=True)]
+    kind = opencv.SIFT()
+    keypoints = [opencv.detect(kind, image, 2000) for image in (first, third)]
+    described = [opencv.describe(kind, image, each) for image, each in zip((first, third), keypoints, strict=True)]
     found = match.match(*described)
     used = np.flatnonzero(np.asarray(found.valid))
     uv = np.asarray(keypoints[0].uv)[used], np.asarray(keypoints[1].uv)[np.asarray(found.index)[used]]

@@ -11,7 +11,7 @@ import numpy as np
 
 import jaxloc as jl
 from benchmarks.metric import ACCURACY, RATIO, REPOSITORY, TIME, Metric, Timing, in_fresh_process, quickest, timed
-from jaxloc.data.bundle import StereoBundle, read_stereo_factors
+from jaxloc.data.gtsam_stereo import StereoBundle, read_stereo_factors
 from jaxloc.refinement.bundle import Bundle, Observations, Structure, adjust
 
 RECORDING = REPOSITORY.parent / "shared" / "data" / "stereo_vo_factors_gtsam"

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.metric import ACCURACY, REPOSITORY, Metric, quickest, versus
-from jaxloc.images.chessboard import board_points, find_chessboard
+from jaxloc.features.opencv.chessboard import board_points, find_chessboard
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration import (
     Corners,

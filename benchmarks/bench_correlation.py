@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.metric import ACCURACY, TIME, Metric, quickest, versus
-from jaxloc.alignment import correlation, mutual_information, phase
+from jaxloc.alignment import correlation, mutual_information, phase_correlation
 from jaxloc.images import Affine, Translation
 
 _NAMES = ("camera", "brick", "astronaut", "gravel", "motorcycle_left")
@@ -61,7 +61,7 @@ def _phase(scenes: list[np.ndarray], repeats: int) -> Iterator[Metric]:
     for scene in scenes:
         for shift in rng.uniform(-20, 20, (4, 2)):
             pair = [view[100:356, 100:356] + rng.normal(size=(256, 256)) for view in (scene, _moved(scene, shift))]
-            found = phase.translation(*(jnp.asarray(view, jnp.float32) for view in pair))
+            found = phase_correlation.translation(*(jnp.asarray(view, jnp.float32) for view in pair))
             errors.append(np.linalg.norm(np.asarray(found.value.translation) - shift))
             peers.append(np.linalg.norm(np.array(cv2.phaseCorrelate(*pair, window)[0]) - shift))
     yield Metric("correlation.phase.error", float(np.median(errors)), "px", "lower", ACCURACY)
@@ -69,7 +69,7 @@ def _phase(scenes: list[np.ndarray], repeats: int) -> Iterator[Metric]:
     yield Metric("correlation.phase.error.cv2", float(np.median(peers)), "px")
     single = [np.float32(view) for view in pair]
     arrays = [jnp.asarray(view) for view in single]
-    ours = quickest(lambda: phase.translation(*arrays), repeats)
+    ours = quickest(lambda: phase_correlation.translation(*arrays), repeats)
     theirs = quickest(lambda: cv2.phaseCorrelate(*single, np.float32(window)) and None, repeats)
     yield Metric("correlation.phase", 1e3 * ours.wall, "ms", "lower", TIME)
     yield from versus("correlation.phase.vs_cv2", ours, theirs)
@@ -95,14 +95,18 @@ def _similarity(scenes: list[np.ndarray], count: int, repeats: int) -> Iterator[
             flags, border = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, cv2.BORDER_REFLECT
             image = cv2.warpAffine(scene, back, (256, 256), flags=flags, borderMode=border)
             views = [jnp.asarray(view, jnp.float32) for view in (image, scene[110:366, 110:366])]
-            found = phase.similarity(*views)
+            found = phase_correlation.similarity(*views)
             oks.append(bool(found.ok))
             errors.append(_corner_error(np.asarray(found.value.matrix()), warp, (256, 256)))
     yield Metric("correlation.similarity.error", float(np.median(errors)), "px", "lower", ACCURACY)
     yield Metric("correlation.similarity.right", float(np.mean(np.array(errors) < 1.0)), "share", "higher", 0.02)
     yield Metric("correlation.similarity.ok", float(np.mean(oks)), "share", "higher", 0.02)
     yield Metric(
-        "correlation.similarity", 1e3 * quickest(lambda: phase.similarity(*views), repeats).wall, "ms", "lower", TIME
+        "correlation.similarity",
+        1e3 * quickest(lambda: phase_correlation.similarity(*views), repeats).wall,
+        "ms",
+        "lower",
+        TIME,
     )
 
 

@@ -14,12 +14,12 @@ import numpy as np
 import jaxloc as jl
 from benchmarks.metric import ACCURACY, REPOSITORY, TIME, Metric
 from jaxloc.evaluation import consistency
-from jaxloc.images import detect
-from jaxloc.pipelines import datmo, odometry
+from jaxloc.features import opencv
+from jaxloc.pipelines import moving_objects, odometry
 
 _CLIPS = REPOSITORY.parent / "shared" / "data" / "kitti_odometry"
 _WARM_UP = 4  # frames that compile
-_DETECTORS = {"shi_tomasi": detect.ShiTomasi(), "orb": detect.ORB(), "kaze": detect.KAZE(), "akaze": detect.AKAZE()}
+_DETECTORS = {"shi_tomasi": opencv.ShiTomasi(), "orb": opencv.ORB(), "kaze": opencv.KAZE(), "akaze": opencv.AKAZE()}
 _THRESHOLDS = (0.1, 1.0, 4.0, 16.0)  # nats
 _FEWEST_PIXELS, _FARTHEST = 300, 50.0  # of an object that should be found
 
@@ -36,7 +36,7 @@ def _highway() -> Iterator[Metric]:
     with (_CLIPS / "moving_cars_01.csv").open() as file:
         labels = list(csv.DictReader(file))
     sequence = jl.data.kitti.read_sequence(_CLIPS / "sequences" / "01")
-    steps = list(datmo.steps(list(sequence), sequence.rig))
+    steps = list(moving_objects.steps(list(sequence), sequence.rig))
     hits: dict[str, list[bool]] = {}
     speeds = []
     for row in labels:
@@ -54,14 +54,14 @@ def _highway() -> Iterator[Metric]:
 def _standing_street() -> Iterator[Metric]:
     """KITTI 06: nothing moves."""
     sequence = jl.data.kitti.read_sequence(_CLIPS / "sequences" / "06")
-    steps = list(datmo.steps(list(sequence), sequence.rig))
+    steps = list(moving_objects.steps(list(sequence), sequence.rig))
     false = {track.label for step in steps for track in step.tracks}
     rate = 10.0 * len(false) / len(steps)
     yield Metric("datmo.kitti_06.false_tracks", rate, "per 10 frames", "lower", ACCURACY)
     yield from _times("datmo.kitti_06", steps)
 
 
-def _times(key: str, steps: list[datmo.Step]) -> Iterator[Metric]:
+def _times(key: str, steps: list[moving_objects.Step]) -> Iterator[Metric]:
     stages = {name: [step.timings[name] for step in steps[_WARM_UP:]] for name in steps[-1].timings}
     for name, seconds in stages.items():
         yield Metric(f"{key}.stage.{name}", 1e3 * float(np.median(seconds)), "ms")
@@ -77,7 +77,7 @@ def _rendered(num_frames: int, detectors: tuple[str, ...]) -> Iterator[Metric]:
     for name in detectors:
         config = odometry.Config(detector=_DETECTORS[name])
         evidence = list(odometry.steps_with_evidence(frames, street.rig, config))
-        steps = list(datmo.follow(evidence, street.rig, datmo.Config(odometry=config)))
+        steps = list(moving_objects.follow(evidence, street.rig, moving_objects.Config(odometry=config)))
         key = f"datmo.table_2.{name}"
         found, squared = _compare(steps, truth)
         yield Metric(f"{key}.missed", 100.0 * (1.0 - found), "% of visible", "lower", ACCURACY)
@@ -93,7 +93,9 @@ def _rendered(num_frames: int, detectors: tuple[str, ...]) -> Iterator[Metric]:
             yield Metric(f"datmo.table_4.{name}.{stage}", 100.0 * spent / total, "% of the frame")
         for threshold in _THRESHOLDS:
             merge = jl.beliefs.KullbackLeibler(threshold)
-            steps = list(datmo.follow(evidence, street.rig, datmo.Config(odometry=config, merge=merge)))
+            steps = list(
+                moving_objects.follow(evidence, street.rig, moving_objects.Config(odometry=config, merge=merge))
+            )
             key = f"datmo.table_1.{name}.{threshold:g}_nats".replace("0.1", "01")
             yield Metric(f"{key}.missed", 100.0 * (1.0 - _compare(steps, truth)[0]), "% of visible", "lower", ACCURACY)
             labels = {track.label for step in steps for track in step.tracks}
@@ -118,7 +120,9 @@ def _visible(street: Any, index: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def _compare(steps: list[datmo.Step], truth: list[list[tuple[np.ndarray, np.ndarray]]]) -> tuple[float, np.ndarray]:
+def _compare(
+    steps: list[moving_objects.Step], truth: list[list[tuple[np.ndarray, np.ndarray]]]
+) -> tuple[float, np.ndarray]:
     """Share of the visible objects that a track is at, and squared position errors in sigmas of these."""
     hits, squared = [], []
     for step in steps[2:]:

@@ -21,7 +21,7 @@ import jaxloc as jl
 from benchmarks.metric import ACCURACY, REPOSITORY, TIME, Metric
 from jaxloc.data.tracking import KittiTracking, LabelledTracks
 from jaxloc.evaluation import consistency
-from jaxloc.evaluation.identities import BoxOverlap, Comparison, PointDistance, clear_mot, compare, hota, id_f1
+from jaxloc.evaluation.targets.mot_metrics import BoxOverlap, Comparison, PointDistance, clear_mot, compare, hota, id_f1
 
 _DATA = REPOSITORY.parent / "shared" / "data"
 _SEQUENCES = ("0000", "0001", "0004", "0006", "0010", "0012", "0014", "0018")

@@ -8,13 +8,13 @@ import numpy as np
 from skimage import data
 
 from benchmarks.metric import ACCURACY, TIME, Metric, quickest, versus
-from jaxloc.images import detect, subpixel
-from jaxloc.images.describe import describe
-from jaxloc.images.detectors import ORB, ShiTomasi
-from jaxloc.images.match import match as match_descriptors
-from jaxloc.images.match import row_gate
+from jaxloc.features import opencv, subpixel
+from jaxloc.features.match import match as match_descriptors
+from jaxloc.features.match import row_gate
+from jaxloc.features.opencv.describe import describe
+from jaxloc.features.opencv.detectors import ORB, ShiTomasi
 from jaxloc.multiview.disparity import SSD, ZNCC, BlockMatching, Census, DisparityMap, match, refine
-from jaxloc.slam.stereo_matching import MatchingOptions
+from jaxloc.odometry.stereo_matching import MatchingOptions
 
 _SIZE = 7
 
@@ -28,7 +28,7 @@ def metrics(smoke: bool) -> Iterator[Metric]:
 
 def _sparse(left: np.ndarray, right: np.ndarray, truth: np.ndarray) -> Iterator[Metric]:
     """Corners matched by ORB's descriptors along rows, their columns refined."""
-    points = [detect.detect(ShiTomasi(), image, 3000) for image in (left, right)]
+    points = [opencv.detect(ShiTomasi(), image, 3000) for image in (left, right)]
     words = [describe(ORB(), image, found) for image, found in zip((left, right), points, strict=True)]
     gate = row_gate(points[0].uv, points[1].uv, tolerance=2.0, disparity=(0.0, 100.0))
     pairs = match_descriptors(*words, gate=gate, ratio=0.9)

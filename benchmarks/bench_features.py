@@ -13,17 +13,16 @@ from scipy.spatial import cKDTree
 from skimage import data
 
 from benchmarks.metric import ACCURACY, REPOSITORY, TIME, Metric, quickest, versus
-from jaxloc.images import detect
-from jaxloc.images.blobs import laplacian_gate, sift, surf
-from jaxloc.images.brief import brief, draw_tests, intensity_centroid
-from jaxloc.images.describe import describe
-from jaxloc.images.diffused import Kaze, kaze
-from jaxloc.images.fast import fast
-from jaxloc.images.keypoints import Descriptors, Keypoints
-from jaxloc.images.match import match
-from jaxloc.images.orb import orb
-from jaxloc.images.select import coverage, spread
-from jaxloc.images.suppression import cover_squares
+from jaxloc.features import kaze, opencv, sift, surf
+from jaxloc.features.brief import brief, draw_tests, intensity_centroid
+from jaxloc.features.fast import fast
+from jaxloc.features.kaze import Kaze
+from jaxloc.features.keypoints import Descriptors, Keypoints
+from jaxloc.features.match import match
+from jaxloc.features.opencv.describe import describe
+from jaxloc.features.orb import orb
+from jaxloc.features.select import cover_squares, coverage, spread
+from jaxloc.features.surf import laplacian_gate
 
 RECORDINGS = REPOSITORY.parent / "shared" / "data"
 # Slots; a point is found again within so many pixels; ratio of the nearest distance to the next.
@@ -66,10 +65,10 @@ def on_arrays(function: Callable, image: np.ndarray) -> tuple[Keypoints, Descrip
     return function(jnp.asarray(image, jnp.float32))
 
 
-def on_host(kind: detect.AbstractDetector, image: np.ndarray) -> tuple[Keypoints, Descriptors]:
+def on_host(kind: opencv.AbstractDetector, image: np.ndarray) -> tuple[Keypoints, Descriptors]:
     """OpenCV's strongest keypoints, described by the same feature; FAST's by ORB."""
-    keypoints = detect.detect(kind, image, CAPACITY, (1, 1))
-    return keypoints, describe(detect.ORB() if isinstance(kind, detect.FAST) else kind, image, keypoints)
+    keypoints = opencv.detect(kind, image, CAPACITY, (1, 1))
+    return keypoints, describe(opencv.ORB() if isinstance(kind, opencv.FAST) else kind, image, keypoints)
 
 
 @eqx.filter_jit
@@ -91,11 +90,11 @@ def features(smoke: bool) -> dict[str, Feature]:
         "orb": (partial(orb, capacity=CAPACITY), 256.0),
     }
     peers = {
-        "sift": detect.SIFT(),
-        "kaze": detect.KAZE(threshold=1e-3),
-        "akaze": detect.AKAZE(threshold=1e-3),
-        "fast": detect.FAST(threshold=20),
-        "orb": detect.ORB(fast_threshold=20),
+        "sift": opencv.SIFT(),
+        "kaze": opencv.KAZE(threshold=1e-3),
+        "akaze": opencv.AKAZE(threshold=1e-3),
+        "fast": opencv.FAST(threshold=20),
+        "orb": opencv.ORB(fast_threshold=20),
     }
     if smoke:
         ours = {name: ours[name] for name in ("surf", "akaze", "fast")}

@@ -20,7 +20,7 @@ from jaxloc.refinement.correspondences import (
     SegmentSegment,
     refine,
 )
-from jaxloc.refinement.image_velocity import interaction_matrix, motion_from_flow, twist_from_flow
+from jaxloc.refinement.motion_from_flow import interaction_matrix, motion_from_flow, twist_from_flow
 from jaxloc.refinement.pallet import block_narrow, detect_pallet, euro_long, euro_short, find_pallet
 from jaxloc.solvers import Estimate
 

@@ -9,7 +9,7 @@ import numpy as np
 
 import jaxloc as jl
 from benchmarks.metric import ACCURACY, TIME, Metric, quickest, versus
-from jaxloc.images import describe, detect, match, subpixel
+from jaxloc.features import match, opencv, subpixel
 
 
 def metrics(smoke: bool) -> Iterator[Metric]:
@@ -22,11 +22,11 @@ def metrics(smoke: bool) -> Iterator[Metric]:
 
 def _detect(image: np.ndarray, repeats: int) -> Iterator[Metric]:
     """Evenly spread keypoints against the strongest ones of the same detector."""
-    ours = quickest(lambda: detect.detect(detect.ORB(), image).uv, repeats)
+    ours = quickest(lambda: opencv.detect(opencv.ORB(), image).uv, repeats)
     orb = cv2.ORB_create(nfeatures=3000, fastThreshold=12)
     yield Metric("images.detect", 1e3 * ours.wall, "ms", "lower", TIME)
     yield from versus("images.detect.vs_cv2", ours, quickest(lambda: orb.detect(image) and None, repeats))
-    keypoints = detect.detect(detect.ORB(), image)
+    keypoints = opencv.detect(opencv.ORB(), image)
     uv = np.asarray(keypoints.uv)[np.asarray(keypoints.valid)]
     cells = np.unique((uv / np.array(image.shape[::-1]) * np.array([8, 6])).astype(int), axis=0)
     yield Metric("images.detect.cells", len(cells) / 48, "share", "higher", ACCURACY)
@@ -34,9 +34,9 @@ def _detect(image: np.ndarray, repeats: int) -> Iterator[Metric]:
 
 def _match(frame: jl.data.StereoFrame, capacity: int, repeats: int) -> Iterator[Metric]:
     """Mutual nearest neighbors of binary descriptors of a stereo pair."""
-    kind, described = detect.ORB(), []
+    kind, described = opencv.ORB(), []
     for image in (frame.left, frame.right):
-        described.append(describe.describe(kind, image, detect.detect(kind, image, capacity)))
+        described.append(opencv.describe(kind, image, opencv.detect(kind, image, capacity)))
     ours = quickest(lambda: match.match(*described).index, repeats)
     yield Metric("images.match", 1e3 * ours.wall, "ms", "lower", TIME)
     values = [np.asarray(side.values)[np.asarray(side.valid)] for side in described]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.metric import ACCURACY, RATIO, TIME, Metric, Timing, compiled, timed
-from jaxloc.alignment.tracker import Klt, Tracked, prepare, track, track_frames
+from jaxloc.alignment.klt import Klt, Tracked, prepare, track, track_frames
 
 WINDOW = {"winSize": (21, 21), "maxLevel": 3}
 IMAGES = "camera", "brick", "astronaut", "motorcycle_left", "gravel", "grass"

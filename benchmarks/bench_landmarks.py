@@ -14,7 +14,6 @@ from benchmarks.metric import ACCURACY, TIME, Metric, quickest
 from jaxloc.data.landmarks import LandmarkLog, read_factors, read_mrclam, read_ranging
 from jaxloc.data.simulate.landmarks import simulate_landmarks
 from jaxloc.filters import ExtendedKalmanFilter, SigmaPointFilter, run
-from jaxloc.filters.rao_blackwell import Appearance, DescriptorFastSlam, FastSlam, FromBlock, FromMotion, FromReading
 from jaxloc.sensors import (
     DescribedReading,
     IncrementMotion,
@@ -26,6 +25,7 @@ from jaxloc.sensors import (
 )
 from jaxloc.sensors.landmarks import confusion
 from jaxloc.slam.ekf_slam import EkfSlam
+from jaxloc.slam.fast_slam import Appearance, DescriptorFastSlam, FastSlam, FromBlock, FromMotion, FromReading
 
 _RECORDINGS = Path(__file__).resolve().parents[2] / "shared" / "data"
 _MRCLAM_CLOCK = 1248272272.94  # stamp of time zero of the motion capture, from the recording's notes

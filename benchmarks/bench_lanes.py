@@ -14,10 +14,10 @@ import numpy as np
 
 import jaxloc as jl
 from benchmarks.metric import ACCURACY, TIME, Metric, compiled, quickest
-from jaxloc.alignment import ralph
-from jaxloc.alignment.ground_view import GroundGrid, GroundView, look
-from jaxloc.data.simulate.road import Road, Streak, render
-from jaxloc.data.simulate.road_drive import Course, RoadDrive, drive
+from jaxloc.data.simulate.road.drive import Course, RoadDrive, drive
+from jaxloc.data.simulate.road.rendering import Road, Streak, render
+from jaxloc.lanes import ralph
+from jaxloc.lanes.ground_view import GroundGrid, GroundView, look
 
 PITCH = 0.03
 GROUND = jl.sensors.GroundCamera(jl.sensors.Pinhole(600.0, 600.0, 319.5, 199.5), 1.3, PITCH)
@@ -53,7 +53,7 @@ def view_of(picture: np.ndarray, wrong_pitch: float = 0.0) -> GroundView:
 
 def template_of(road: Road, pictures: int = 8) -> ralph.Template:
     """What a driver saves who keeps to the middle of a straight lane for a while: the mean of some pictures."""
-    template, straight = None, jl.sensors.Lane(0.0, 0.0, 0.0)
+    template, straight = None, jl.lanes.Lane(0.0, 0.0, 0.0)
     for index in range(pictures):
         view = view_of(render(road, straight, GROUND, travelled=5.0 + 37.0 * index))
         fresh = ralph.capture(view, ralph.LaneFit())
@@ -69,7 +69,7 @@ def trials(road: Road, wrong_pitch: float, count: int) -> Errors:
         if index % 10 == 0:
             template = template_of(here)
         truth = np.array([rng.uniform(-0.6, 0.6), rng.uniform(-0.03, 0.03), rng.uniform(-2e-3, 2e-3), wrong_pitch])
-        picture = render(here, jl.sensors.Lane(*truth[:3]), GROUND, travelled=rng.uniform(50, 900), seed=index)
+        picture = render(here, jl.lanes.Lane(*truth[:3]), GROUND, travelled=rng.uniform(50, 900), seed=index)
         found = ralph.estimate(view_of(picture, wrong_pitch), template)
         value = found.estimate.value
         error = np.array([value.offset, value.heading, value.curvature, value.pitch]) - truth
@@ -93,7 +93,7 @@ def _accuracy(key: str, road: Road, wrong_pitch: float, count: int) -> Iterator[
 def _time(repeats: int, batch: int) -> Iterator[Metric]:
     road = Road()
     template = template_of(road)
-    picture = jnp.asarray(render(road, jl.sensors.Lane(0.3, 0.01, 1e-3), GROUND, travelled=100.0))
+    picture = jnp.asarray(render(road, jl.lanes.Lane(0.3, 0.01, 1e-3), GROUND, travelled=100.0))
     grid = GroundGrid.for_speed(SPEED)
 
     def whole(picture, template):

@@ -87,7 +87,7 @@ def _building(folder: Path, num_seeds: int, num_tracked: int) -> Iterator[Metric
     """Freiburg, building 079: the map was made of the even keyframes, the odd ones are tracked by raw odometry."""
     log = jl.data.carmen.read_log(folder / "fr079_corrected.log.gz")
     keyframes = np.load(folder / "keyframes.npz")
-    grid = jl.data.maps.read_map(folder / "map_from_even_scans.yaml")
+    grid = jl.data.ros_map.read_map(folder / "map_from_even_scans.yaml")
     truth, odometry = keyframes["ref"][1::2], keyframes["odom"][1::2]
     scans = log.scans(slice(1, None, 2)).thin(_BEAMS)
     motions = _stack(np.concatenate([np.zeros((1, 3)), relative_poses(odometry[:-1], odometry[1:])]))

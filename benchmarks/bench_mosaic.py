@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.metric import ACCURACY, TIME, Metric, quickest, timed, versus
-from jaxloc.alignment import mosaic
 from jaxloc.data.simulate import floor
 from jaxloc.evaluation import update_rate
 from jaxloc.pipelines import floor_mosaic
 from jaxloc.poses import SE2
 from jaxloc.poses.planar import compose_poses, relative_poses
+from jaxloc.slam import mosaic
 
 
 def metrics(smoke: bool) -> Iterator[Metric]:

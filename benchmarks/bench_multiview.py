@@ -27,7 +27,7 @@ def _p3p(count: int, repeats: int) -> Iterator[Metric]:
     seen = np.einsum("bji,bnj->bni", problems.truth[:, :3, :3], problems.points - problems.truth[:, None, :3, 3])
     rays = seen / np.linalg.norm(seen, axis=-1, keepdims=True)
     arguments = jnp.asarray(rays, jnp.float32), jnp.asarray(problems.points, jnp.float32)
-    run = jax.jit(jax.vmap(jl.multiview.minimal.p3p))
+    run = jax.jit(jax.vmap(jl.multiview.p3p.p3p))
     found = run(*arguments)
     error = np.linalg.norm(np.asarray(found.poses.translation) - problems.truth[:, None, :3, 3], axis=-1)
     best = np.where(np.asarray(found.valid), error, np.inf).min(axis=1)
@@ -52,14 +52,14 @@ def _p3p(count: int, repeats: int) -> Iterator[Metric]:
 
 def _stereo(count: int, repeats: int) -> Iterator[Metric]:
     """Points with covariance; the peer gives points alone."""
-    rig = jl.data.simulate.points.kitti_rig()
+    rig = jl.data.simulate.stereo_points.kitti_rig()
     rng = np.random.default_rng(6)
     depth = rng.uniform(4.0, 60.0, count)
     points = np.stack([rng.uniform(-0.5, 0.5, count) * depth, rng.uniform(-0.2, 0.2, count) * depth, depth], axis=1)
     measured = rig.project(jnp.asarray(points, jnp.float32))
     noise = 0.25 * jnp.eye(3, dtype=jnp.float32)
     plain = jax.jit(lambda measured: rig.triangulate(measured))
-    dense = jax.jit(jax.vmap(lambda z: jl.multiview.triangulation.stereo(rig, z, noise)))
+    dense = jax.jit(jax.vmap(lambda z: jl.multiview.stereo_triangulation.triangulate(rig, z, noise)))
     ours = quickest(lambda: plain(measured), repeats)
     yield Metric("multiview.triangulate", 1e9 * ours.wall / count, "ns", "lower", TIME)
     took = quickest(lambda: dense(measured), repeats)
@@ -79,7 +79,7 @@ def _stereo(count: int, repeats: int) -> Iterator[Metric]:
 
 def _coverage(num_trials: int) -> Iterator[Metric]:
     """How often the 95 % ellipsoid of a point 8 m and 40 m away holds the truth."""
-    rig = jl.data.simulate.points.kitti_rig()
+    rig = jl.data.simulate.stereo_points.kitti_rig()
     noise = 0.25 * jnp.eye(3, dtype=jnp.float32)
     for depth in (8.0, 40.0):
         point = jnp.array([1.0, 0.5, depth], jnp.float32)
@@ -110,7 +110,7 @@ def _ransac(hypotheses: int, num_points: int, repeats: int) -> Iterator[Metric]:
 
 
 def _poses_of_three(sample: dict) -> Candidates:
-    found = jl.multiview.minimal.p3p(sample["rays"], sample["points"])
+    found = jl.multiview.p3p.p3p(sample["rays"], sample["points"])
     return Candidates(found.poses, found.valid)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 
 import jaxloc as jl
 from benchmarks.metric import ACCURACY, RATIO, TIME, Metric, Timing, timed, versus
-from jaxloc.evaluation import consistency, drift
+from jaxloc.evaluation import consistency
+from jaxloc.evaluation.trajectories import kitti_drift
 
 _NOISE = 0.5
 
@@ -24,7 +25,7 @@ def metrics(smoke: bool) -> Iterator[Metric]:
 
 def _simulated(num_seeds: int, num_frames: int) -> Iterator[Metric]:
     """300 matches a frame, 0.5 px of noise, a quarter of the matches wrong; drift as the KITTI benchmark has it."""
-    rig = jl.data.simulate.points.kitti_rig()
+    rig = jl.data.simulate.stereo_points.kitti_rig()
     keys = jax.random.split(jax.random.key(0), num_seeds)
     drives = [jl.data.simulate_stereo_points(key=key, num_frames=num_frames) for key in keys]
     run = jax.jit(partial(_motions, rig))
@@ -56,7 +57,7 @@ def _motions(rig: jl.sensors.StereoRig, pairs: jl.data.StereoPairs, key: jax.Arr
     def step(previous: jl.poses.SE3, item: tuple) -> tuple:
         pair, key = item
         matches = jl.refinement.StereoMatches.of(pair.previous, pair.current, noise, noise, None)
-        estimate = jl.slam.visual_odometry.estimate_motion(rig, matches, previous, key=key).estimate
+        estimate = jl.odometry.visual_odometry.estimate_motion(rig, matches, previous, key=key).estimate
         return estimate.value, estimate
 
     keys = jax.random.split(key, pairs.previous.shape[0])
@@ -94,8 +95,8 @@ def _path_errors(
     motions: jl.poses.SE3, drive: jl.data.StereoDrive, lengths: tuple[float, ...] | None = None
 ) -> tuple[float, float]:
     path = jl.poses.Trajectory(drive.truth.times, jl.poses.chain(drive.truth[0], motions))
-    lengths = lengths or drift.fitting_lengths(float(drive.truth.length()))
-    errors = drift.segment_errors(path, drive.truth, lengths=lengths)
+    lengths = lengths or kitti_drift.fitting_lengths(float(drive.truth.length()))
+    errors = kitti_drift.segment_errors(path, drive.truth, lengths=lengths)
     return float(errors.translation_percent()), float(errors.rotation_deg_per_meter())
 
 
@@ -126,7 +127,7 @@ def _street(num_frames: int) -> Iterator[Metric]:
         estimate = jl.poses.Trajectory.from_matrices(
             sequence.truth.times, jnp.asarray(path, sequence.truth.times.dtype)
         )
-        percent = float(drift.end_drift_percent(estimate, sequence.truth))
+        percent = float(kitti_drift.end_drift_percent(estimate, sequence.truth))
         yield Metric(f"odometry.street.drift{name}", percent, "%", "lower", None if name else RATIO)
 
 

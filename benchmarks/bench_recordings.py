@@ -9,7 +9,8 @@ import numpy as np
 
 import jaxloc as jl
 from benchmarks.metric import ACCURACY, REPOSITORY, TIME, Metric
-from jaxloc.evaluation import drift, trajectories
+from jaxloc.evaluation import trajectories
+from jaxloc.evaluation.trajectories import kitti_drift
 
 _SEQUENCES = REPOSITORY.parent / "shared" / "data" / "kitti_odometry" / "sequences"
 
@@ -36,7 +37,7 @@ def _clip(name: str, folder: Path, smoke: bool) -> Iterator[Metric]:
     yield Metric(f"{key}.frames_per_second", 1.0 / float(total), "1/s", "higher", TIME)
     offset = float(odometry.calibrate_disparity(frames[:20], sequence.rig, config).mean[0])
     yield Metric(f"{key}.disparity_offset", offset, "px", "equal", ACCURACY)
-    mended = odometry.Config(matching=jl.slam.MatchingOptions(disparity_offset=offset))
+    mended = odometry.Config(matching=jl.odometry.MatchingOptions(disparity_offset=offset))
     yield from _accuracy(f"{key}.calibrated", list(odometry.steps(frames, sequence.rig, mended)), sequence.truth)
 
 
@@ -45,7 +46,7 @@ def _accuracy(key: str, steps: list, truth: jl.poses.Trajectory) -> Iterator[Met
     poses = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[step.pose for step in steps])
     path = jl.poses.Trajectory(truth.times[: len(steps)], poses)
     truth = jl.poses.Trajectory(path.times, truth[: len(steps)])
-    yield Metric(f"{key}.drift", float(drift.end_drift_percent(path, truth)), "%", "lower", ACCURACY)
+    yield Metric(f"{key}.drift", float(kitti_drift.end_drift_percent(path, truth)), "%", "lower", ACCURACY)
     rotation = jnp.rad2deg(trajectories.rpe(path, truth).rotation.median())
     yield Metric(f"{key}.rotation", float(rotation), "deg/frame", "lower", ACCURACY)
     yield Metric(f"{key}.length_ratio", float(path.length() / truth.length()), "", "equal", ACCURACY)

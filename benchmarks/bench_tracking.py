@@ -13,7 +13,7 @@ from benchmarks import learning, stone_soup
 from benchmarks.metric import ACCURACY, TIME, Metric, Timing, compiled, quickest, timed, versus
 from jaxloc.beliefs import Mixture
 from jaxloc.data.simulate.targets import LinearScenario, TargetScenario, TurningScenario, simulate_targets
-from jaxloc.evaluation.targets import ospa
+from jaxloc.evaluation.targets.ospa import ospa
 from jaxloc.filters import ExtendedKalmanFilter, Filter, KalmanFilter, SigmaPointFilter, Unscented, run
 from jaxloc.tracking import GmCphd, GmPhd, PointBirth, StaticBirth, TargetModel, UniformClutter, gmphd
 

@@ -119,7 +119,7 @@ plt.show()
 # and a mask beside the values.
 
 # %%
-lens = jl.sensors.distortion.BrownConrady((-0.3, 0.1, 0.0, 0.0, 0.0))
+lens = jl.sensors.lenses.BrownConrady((-0.3, 0.1, 0.0, 0.0, 0.0))
 camera = jl.sensors.Pinhole(500.0, 500.0, 320.0, 240.0, lens=lens)
 points = jnp.array([[0.5, 0.2, 4.0], [0.0, 0.0, -1.0]])
 print("pixels:", *camera.project(points), " in front:", camera.in_front(points))
@@ -155,13 +155,13 @@ print(jax.jacobian(pixel)(jnp.zeros(6)).round(1))
 # error grows with the square of the distance.
 
 # %%
-rig = jl.data.simulate.points.kitti_rig()
+rig = jl.data.simulate.stereo_points.kitti_rig()
 depths = jnp.linspace(4.0, 60.0, 29)
 measured = rig.project(jnp.stack([jnp.zeros_like(depths), jnp.zeros_like(depths), depths], axis=1))
 
 
 def sigma(measurement):
-    return jnp.sqrt(jl.multiview.triangulation.stereo(rig, measurement, 0.25 * jnp.eye(3)).covariance[2, 2])
+    return jnp.sqrt(jl.multiview.stereo_triangulation.triangulate(rig, measurement, 0.25 * jnp.eye(3)).covariance[2, 2])
 
 
 axes = plt.figure(figsize=(6, 3)).add_subplot()

@@ -38,7 +38,7 @@ plt.show()
 
 # %%
 drive = jl.data.simulate_stereo_points(key=jax.random.key(0), num_frames=30 if FAST else 300)
-rig = jl.data.simulate.points.kitti_rig()
+rig = jl.data.simulate.stereo_points.kitti_rig()
 noise = 0.25 * jnp.eye(3)
 
 
@@ -47,7 +47,7 @@ def motions(pairs, keys):
     def advance(previous, item):
         pair, key = item
         matches = jl.refinement.StereoMatches.of(pair.previous, pair.current, noise, noise, None)
-        found = jl.slam.estimate_motion(rig, matches, previous, key=key)
+        found = jl.odometry.estimate_motion(rig, matches, previous, key=key)
         return found.estimate.value, found
 
     return jax.lax.scan(advance, jl.poses.SE3.identity(), (pairs, keys))[1]
@@ -73,10 +73,10 @@ print("within the 50 % and 95 % ellipsoids:", held)
 
 # %%
 path = jl.poses.Trajectory(drive.truth.times, jl.poses.chain(drive.truth[0], found.estimate.value))
-lengths = jl.evaluation.drift.fitting_lengths(float(drive.truth.length()))
+lengths = jl.evaluation.trajectories.kitti_drift.fitting_lengths(float(drive.truth.length()))
 errors = jl.evaluation.segment_errors(path, drive.truth, lengths=lengths)
 print(f"drift {float(errors.translation_percent()):.2f} % over {float(drive.truth.length()):.0f} m")
-jl.evaluation.plot.draw_trajectory(path, drive.truth)
+jl.evaluation.plots.trajectories.draw_trajectory(path, drive.truth)
 
 # %% [markdown]
 # ## From images
@@ -96,7 +96,7 @@ print(f"drift at the end: {float(jl.evaluation.end_drift_percent(estimate, stree
 # %%
 step = steps[len(steps) // 2]
 image = street[len(steps) // 2].left
-figure = jl.evaluation.plot.draw_matches(image, step.uv_previous, step.uv_current, step.inlier)
+figure = jl.evaluation.plots.trajectories.draw_matches(image, step.uv_previous, step.uv_current, step.inlier)
 figure.set_dpi(60)
 figure
 
@@ -106,7 +106,7 @@ figure
 
 # %%
 covariances = np.stack([np.asarray(step.covariance) for step in steps])
-jl.evaluation.plot.draw_ellipses(estimate, covariances, street.truth)
+jl.evaluation.plots.trajectories.draw_ellipses(estimate, covariances, street.truth)
 
 # %% [markdown]
 # The same from the command line, with a report: `jaxloc demo`, or `jaxloc odometry SEQUENCE` for a recording

@@ -44,11 +44,11 @@ plt.show()
 
 # %%
 count = 12 if FAST else len(log)
-config = jl.pipelines.laser_localization.Config(
+config = jl.pipelines.localization.Config(
     num_particles=300 if FAST else 1000, num_particles_global=1000 if FAST else 10_000
 )
 steps = []
-for step in jl.pipelines.laser_localization.steps(log, grid, config=config):
+for step in jl.pipelines.localization.steps(log, grid, config=config):
     steps.append(step)
     if len(steps) == count:
         break
@@ -124,10 +124,10 @@ def landmark_error(maps):
 
 
 for name, proposal in (
-    ("FastSLAM 1", jl.filters.rao_blackwell.FromMotion()),
-    ("FastSLAM 2", jl.filters.rao_blackwell.FromReading()),
+    ("FastSLAM 1", jl.slam.fast_slam.FromMotion()),
+    ("FastSLAM 2", jl.slam.fast_slam.FromReading()),
 ):
-    fast = jl.filters.FastSlam(motion, *deviations, num_particles=100, capacity=20, proposal=proposal)
+    fast = jl.slam.FastSlam(motion, *deviations, num_particles=100, capacity=20, proposal=proposal)
 
     def follow(world, key, fast=fast):
         arguments = (world.increments, world.readings, world.valid)

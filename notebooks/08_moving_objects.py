@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxloc as jl
-from jaxloc.pipelines import datmo
+from jaxloc.pipelines import moving_objects
 
 FAST = "JAXLOC_FAST" in os.environ
 plt.rcParams["figure.dpi"] = 70
@@ -29,7 +29,7 @@ street = jl.data.simulate_street(num_frames=18 if FAST else 60, seed=0)
 frames = list(street)
 evidence = list(jl.pipelines.odometry.steps_with_evidence(frames, street.rig))
 step, found = evidence[16]
-points = jl.slam.find_moving(
+points = jl.odometry.find_moving(
     street.rig, found.reference, found.current, found.matches, found.motion, jnp.array(0.1, jnp.float32)
 )
 valid = np.asarray(points.valid)
@@ -48,7 +48,7 @@ plt.show()
 # and move alike are one object, whose velocity is known much better:
 
 # %%
-objects = jl.slam.group_points(points)
+objects = jl.odometry.group_points(points)
 for i in np.flatnonzero(objects.valid):
     sigma = np.sqrt(np.diagonal(objects.velocity_covariances[i]))
     velocity = np.asarray(objects.velocities[i])
@@ -62,7 +62,7 @@ for i in np.flatnonzero(objects.valid):
 # The filter knows where the camera is, how surely, and what it can see from there: an object out of view is not missed.
 
 # %%
-steps = list(datmo.follow(evidence, street.rig))
+steps = list(moving_objects.follow(evidence, street.rig))
 figure, axes = plt.subplots(figsize=(5, 6))
 camera = np.array([np.asarray(one.odometry.pose.translation) for one in steps])
 axes.plot(camera[:, 0], camera[:, 2], "k", label="camera")

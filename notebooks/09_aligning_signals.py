@@ -17,8 +17,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxloc as jl
+from jaxloc.alignment import klt, multi_start, mutual_information
 from jaxloc.alignment import lucas_kanade as lk
-from jaxloc.alignment import multi_start, mutual_information, tracker
 
 sys.path.insert(0, str(next(p for p in (Path.cwd(), Path.cwd().parent) if (p / "benchmarks").is_dir())))
 from benchmarks import baker_matthews as protocol
@@ -147,7 +147,7 @@ for label, align in {"gain and bias": lk.align, "mutual information": mutual_inf
 # %%
 current = 0.7 * jnp.asarray(jnp.roll(image, (2, 3), (0, 1))) + 20
 points = jax.random.uniform(jax.random.key(1), (400, 2), minval=20.0, maxval=jnp.array([300.0, 220.0]))
-found = tracker.track(image, current, points)
+found = klt.track(image, current, points)
 off = jnp.linalg.norm(found.points - points - jnp.array([3.0, 2.0]), axis=1)
 print(f"{float(found.ok.mean()):.0%} tracked, median error {float(jnp.median(off[found.ok])):.3f} px")
 

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 
 import jaxloc as jl
-from jaxloc.alignment import ralph
-from jaxloc.alignment.ground_view import GroundGrid, look
-from jaxloc.data.simulate.road import Road, Streak, render
-from jaxloc.data.simulate.road_drive import Course, drive
+from jaxloc.data.simulate.road.drive import Course, drive
+from jaxloc.data.simulate.road.rendering import Road, Streak, render
+from jaxloc.lanes import ralph
+from jaxloc.lanes.ground_view import GroundGrid, look
 
 FAST = "JAXLOC_FAST" in os.environ
 plt.rcParams["figure.dpi"] = 70
@@ -33,7 +33,7 @@ shape = (240, 320) if FAST else (480, 640)
 scale = shape[1] / 640
 pinhole = jl.sensors.Pinhole(600.0 * scale, 600.0 * scale, 319.5 * scale, 199.5 * scale)
 ground = jl.sensors.GroundCamera(pinhole, height=1.3, pitch=0.03)
-road, truth = Road(), jl.sensors.Lane(offset=0.3, heading=0.01, curvature=1.5e-3)
+road, truth = Road(), jl.lanes.Lane(offset=0.3, heading=0.01, curvature=1.5e-3)
 picture = render(road, truth, ground, shape=shape, travelled=100.0)
 view = look(ground, jnp.asarray(picture), GroundGrid.for_speed(20.0))
 straight = ralph.straighten(view, ralph.LaneFit(0.3, 0.01, 1.5e-3), view.grid.left)
@@ -68,7 +68,7 @@ plt.show()
 # across the road do not matter. The covariance comes from leaving out stretches of road, and bands of it.
 
 # %%
-saved = look(ground, jnp.asarray(render(road, jl.sensors.Lane(0.0, 0.0, 0.0), ground, shape=shape)), view.grid)
+saved = look(ground, jnp.asarray(render(road, jl.lanes.Lane(0.0, 0.0, 0.0), ground, shape=shape)), view.grid)
 template = ralph.capture(saved, ralph.LaneFit())
 state = ralph.estimate(view, template)
 sigma = jnp.sqrt(jnp.diag(state.estimate.covariance))

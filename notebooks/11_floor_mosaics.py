@@ -76,7 +76,7 @@ plt.show()
 #
 # - Pictures of a floor are worth more than odometry by orders of magnitude, and each comes with its covariance.
 # - The slide's Jacobian for features of a mosaic lacks the turn of the second picture;
-#   `jaxloc.alignment.mosaic.feature_jacobian` has it.
+#   `jaxloc.slam.mosaic.feature_jacobian` has it.
 # - A picture that overlaps no other is left out and named; nothing is made up.
 #
 # ## Next steps

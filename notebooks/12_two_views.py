@@ -17,13 +17,14 @@ import numpy as np
 from skimage import data
 
 import jaxloc as jl
-from jaxloc.images import detect
-from jaxloc.images.describe import describe
-from jaxloc.images.detectors import SIFT
-from jaxloc.images.match import match
-from jaxloc.multiview import ConsensusOptions, RelativePose, disparity, estimate_relative_pose, intersect
+from jaxloc.features import opencv
+from jaxloc.features.match import match
+from jaxloc.features.opencv.describe import describe
+from jaxloc.features.opencv.detectors import SIFT
+from jaxloc.multiview import ConsensusOptions, RelativePose, disparity, estimate_relative_pose
 from jaxloc.multiview.epipolar import epipolar_gate, epipolar_lines, fundamental, sampson_distance
 from jaxloc.multiview.rectification import rectifying_homographies
+from jaxloc.multiview.triangulation import triangulate
 
 FAST = "JAXLOC_FAST" in os.environ
 plt.rcParams["figure.dpi"] = 50
@@ -99,7 +100,7 @@ print(f"a camera that turns: ok {jnp.mean(still.ok):.0%}")
 bytes_left, bytes_right = (cv2.cvtColor(color, cv2.COLOR_RGB2GRAY) for color in colors)
 left, right = (jnp.asarray(grey, jnp.float32) for grey in (bytes_left, bytes_right))
 cameras = [jl.sensors.Pinhole(994.978, 994.978, cx, 254.877) for cx in (311.193, 342.279)]
-found = [detect.detect(SIFT(), grey, 1500) for grey in (bytes_left, bytes_right)]
+found = [opencv.detect(SIFT(), grey, 1500) for grey in (bytes_left, bytes_right)]
 words = [describe(SIFT(), grey, keypoints) for grey, keypoints in zip((bytes_left, bytes_right), found, strict=True)]
 pairs = match(*words, ratio=0.85)
 first, second = found[0].uv, found[1].uv[pairs.index]
@@ -145,7 +146,7 @@ baseline = 0.193
 stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), jl.poses.SE3.identity(), fit.value.pose(baseline))
 both = jnp.stack([cameras[0].normalize(first), cameras[1].normalize(second)], axis=1)
 unit = jl.sensors.Pinhole(1.0, 1.0, 0.0, 0.0)
-points = jax.jit(jax.vmap(lambda seen: intersect(unit, stack, seen, sigma=0.7 / 995.0)))(both)
+points = jax.jit(jax.vmap(lambda seen: triangulate(unit, stack, seen, sigma=0.7 / 995.0)))(both)
 column, row = np.round(np.asarray(first)).astype(int).T
 true = true_disparity[np.clip(row, 0, 499), np.clip(column, 0, 740)]
 depth = 994.978 * baseline / (true + 31.086)

@@ -16,7 +16,7 @@ import numpy as np
 
 import jaxloc as jl
 from jaxloc.data.simulate.pallet import make_camera, render_pallet
-from jaxloc.refinement.image_velocity import interaction_matrix, motion_from_flow, twist_from_flow
+from jaxloc.refinement.motion_from_flow import interaction_matrix, motion_from_flow, twist_from_flow
 from jaxloc.refinement.pallet import (
     block_narrow,
     detect_pallet,

@@ -141,5 +141,5 @@ plt.show()
 #
 # ## Next steps
 #
-# `jaxloc.data.bundle.read_stereo_factors` reads a recorded bundle; `jaxloc.slam.pose_graph` closes loops where points
-# are gone.
+# `jaxloc.data.gtsam_stereo.read_stereo_factors` reads a recorded bundle; `jaxloc.slam.pose_graph` closes loops where
+# points are gone.

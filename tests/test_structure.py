@@ -135,7 +135,7 @@ def test_rooms_import_only_lower_rows():
 
 
 def test_no_room_starts_a_backend():
-    rooms = sorted({module_of(path) for path in FILES} - {"jaxloc.__main__", "jaxloc.cli.commands"})
+    rooms = sorted({module_of(path) for path in FILES} - {"jaxloc.__main__", "jaxloc.cli.app"})
     run_python(f"import importlib\nfor name in {rooms!r}: importlib.import_module(name)", JAX_PLATFORMS="no_such")
 
 

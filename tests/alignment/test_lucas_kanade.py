@@ -11,9 +11,9 @@ from scipy.ndimage import map_coordinates, spline_filter
 import jaxloc as jl
 from jaxloc.alignment import ecc, multi_start
 from jaxloc.alignment import lucas_kanade as lk
-from jaxloc.alignment.lucas_kanade.conclusion import Evidence
-from jaxloc.alignment.lucas_kanade.equations import equations
-from jaxloc.alignment.lucas_kanade.level import Frame
+from jaxloc.alignment.lucas_kanade.covariance import Evidence
+from jaxloc.alignment.lucas_kanade.normal_equations import equations
+from jaxloc.alignment.lucas_kanade.pyramid_level import Frame
 from jaxloc.images.warps import Affine, Euclidean, Homography, Similarity, Translation
 from jaxloc.solvers import Huber, Status, Tukey
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from jaxloc.data import covariance
-from jaxloc.data.sequence import DataError
-from jaxloc.data.writing import RowWriter
+from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.writing import RowWriter
 
 
 def test_covariances_survive_a_round_trip(tmp_path, rng):

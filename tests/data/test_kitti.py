@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxloc.data import kitti
-from jaxloc.data.sequence import DataError
+from jaxloc.data.io.errors import DataError
 from jaxloc.poses import Trajectory
 
 P0 = "P0: 700 0 30 0 0 700 20 0 0 0 1 0"

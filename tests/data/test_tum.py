@@ -4,7 +4,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxloc.data import tum
-from jaxloc.data.sequence import DataError
+from jaxloc.data.io.errors import DataError
 from jaxloc.poses import Trajectory
 
 

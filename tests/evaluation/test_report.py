@@ -3,7 +3,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from jaxloc.evaluation import plot
+from jaxloc.evaluation import plots
 from jaxloc.evaluation.report import Highlight, Section, Table, encode_figure, render_report
 
 
@@ -29,7 +29,7 @@ class Page(HTMLParser):
 
 
 def test_the_page_holds_everything_and_escapes_text():
-    figure = plot.draw_drift(np.arange(4.0), np.ones(4))
+    figure = plots.draw_drift(np.arange(4.0), np.ones(4))
     table = Table(("metric", "value"), (("a", "1"), ("<b>", "2 & 3")))
     sections = [
         Section("Drift", "<script>alert(1)</script>", figure),
@@ -47,7 +47,7 @@ def test_the_page_holds_everything_and_escapes_text():
 
 
 def test_figures_are_encoded():
-    figure = plot.draw_drift(np.arange(4.0), np.ones(4))
+    figure = plots.draw_drift(np.arange(4.0), np.ones(4))
     png = base64.b64decode(encode_figure(figure, raster=True).partition(",")[2])
     assert png.startswith(b"\x89PNG")
     assert b"<svg" in base64.b64decode(encode_figure(figure).partition(",")[2])

@@ -10,7 +10,7 @@ import scipy.optimize
 from jaxloc.beliefs import Gaussian, Sensor, chi2_quantile
 from jaxloc.filters import BodyTwist, ConstantVelocity, ExtendedKalmanFilter, SigmaPointFilter, TwistMotion, run
 from jaxloc.poses import SE2, SO2, local, retract
-from jaxloc.solvers.robust import Huber, Tukey
+from jaxloc.solvers.robust_kernels import Huber, Tukey
 
 RUNS, STEPS = 200, 20
 

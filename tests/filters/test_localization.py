@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxloc.beliefs import Gaussian, KLDSize, Particles, Sensor
-from jaxloc.data import carmen, maps, simulate_laser_drive
+from jaxloc.data import carmen, ros_map, simulate_laser_drive
 from jaxloc.filters import MonteCarloLocalization, Recovery, run
 from jaxloc.filters.localization import find_place
 from jaxloc.poses import SE2
@@ -224,7 +224,7 @@ def test_a_real_building(recordings):
     # The map was made of the even keyframes: the odd ones are new to it. Odometry is the raw one.
     log = eqx.tree_at(lambda record: record.odometry, log, keyframes["odom"])
     odd = eqx.tree_at(lambda r: (r.ranges, r.odometry), log, (log.ranges[1::2], log.odometry[1::2]))
-    filt = make_filter(maps.read_map(folder / "map_from_even_scans.yaml"), log.mount)
+    filt = make_filter(ros_map.read_map(folder / "map_from_even_scans.yaml"), log.mount)
     world = World(filt, odd, keyframes["ref"][1::2])
     _, _, position, heading = world.run(
         world.start_near(0, jax.random.key(0), 2000), np.arange(len(odd.odometry)), jax.random.key(1)

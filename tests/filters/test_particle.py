@@ -5,7 +5,7 @@ import pytest
 from jaxtyping import Array
 
 from jaxloc.beliefs import Gaussian, KLDSize, Motion, Particles, Sensor
-from jaxloc.beliefs.resampling import OptimalTransport, Soft
+from jaxloc.beliefs.resampling.strategies import OptimalTransport, Soft
 from jaxloc.filters import Auxiliary, Bootstrap, Guided, ParticleFilter, run
 from jaxloc.poses import SE2, SO2
 

@@ -21,7 +21,7 @@ from jaxloc.filters import (
     smooth_fixed_lag,
     smooth_parallel,
 )
-from jaxloc.filters.blocks import scan_associative
+from jaxloc.filters.parallel.associative_scan import scan_associative
 from jaxloc.poses import SE2, local
 
 STEPS, ACTIVE = 14, np.array([1, 1, 1, 0, 1, 1, 1, 1, 1, 1, 1, 0, 0, 1], bool)

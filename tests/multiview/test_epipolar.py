@@ -70,7 +70,7 @@ def test_sampson_is_the_least_move_to_first_order(views, rng):
     pose, first, second, _ = views
     matrix = fundamental(RelativePose.of(pose).essential(), *cameras())
     first, second = (p + 0.5 * jnp.asarray(rng.normal(size=p.shape)) for p in (first, second))
-    moved = jax.vmap(jl.multiview.intersection.correct_pair, in_axes=(0, 0, None))(first, second, matrix)
+    moved = jax.vmap(jl.multiview.triangulation.correct_pair, in_axes=(0, 0, None))(first, second, matrix)
     length = jnp.sqrt(jnp.sum((moved[0] - first) ** 2 + (moved[1] - second) ** 2, axis=1))
     np.testing.assert_allclose(jnp.abs(sampson_distance(matrix, first, second)), length, rtol=1e-2)
     both = symmetric_distance(matrix, first, second)

@@ -1,140 +1,130 @@
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
-from jaxloc.multiview import Linear, Sampled, Unscented, coverage, stereo
-from jaxloc.multiview.triangulation import stereo_jacobian
-from jaxloc.sensors import Pinhole, StereoRig
+import jaxloc as jl
+from jaxloc.multiview.triangulation import correct_pair, midpoint, triangulate
+from jaxloc.poses import SE3
 
-FOCAL, FOCAL_BASELINE = 718.856, 387.57
-
-
-def kitti(baseline=FOCAL_BASELINE / FOCAL, fy=FOCAL, skew=0.0):
-    return StereoRig(Pinhole(FOCAL, fy, 607.19, 185.2, skew), baseline)
+CAMERA = (500.0, 500.0, 320.0, 240.0)
+SIGMA = 0.5
 
 
-def at(z, dtype):
-    return jnp.asarray([[0.1 * z, 0.05 * z, z]], dtype)
+def cameras(rng, count):
+    """A camera that moves sideways and turns a little."""
+    steps = np.column_stack(
+        [np.linspace(0.0, 2.0, count), rng.uniform(-0.3, 0.3, (count, 2)), 0.05 * rng.normal(size=(count, 3))]
+    )
+    return jax.vmap(SE3.exp)(jnp.asarray(steps))
 
 
-def test_depth_error_of_the_thesis(dtype):  # T-7, T-72
-    rig, noise = kitti(), 0.25 * jnp.eye(3, dtype=dtype)
-    for z, expected in ((10, 0.18), (20, 0.73), (30, 1.64), (50, 4.56)):
-        point = stereo(rig, rig.project(at(z, dtype))[0], noise)
-        assert point.covariance.dtype == dtype
-        assert abs(float(jnp.sqrt(point.covariance[2, 2])) - expected) < 0.006
+def project(poses, point):
+    R, t = np.asarray(poses.rotation.rotation_matrix), np.asarray(poses.translation)
+    local = np.einsum("nji,nj->ni", R, point - t)
+    fx, fy, cx, cy = CAMERA
+    return np.stack([fx * local[:, 0] / local[:, 2] + cx, fy * local[:, 1] / local[:, 2] + cy], axis=1)
 
 
-def test_depth_error_grows_with_range_and_falls_with_baseline(x64):  # T-7
-    noise = 0.25 * jnp.eye(3)
-
-    def sigma(z, baseline):
-        rig = kitti(baseline)
-        measurement = rig.project(jnp.stack([jnp.zeros_like(z), jnp.zeros_like(z), z])[None])[0]
-        return jnp.sqrt(stereo(rig, measurement, noise).covariance[2, 2])
-
-    z, baseline = jnp.geomspace(3.0, 60.0, 12), jnp.geomspace(0.05, 2.0, 12)
-    by_range = jax.vmap(lambda z: sigma(z, jnp.asarray(0.5)))(z)
-    by_baseline = jax.vmap(lambda b: sigma(jnp.asarray(20.0), b))(baseline)
-    assert np.isclose(np.polyfit(np.log(z), np.log(by_range), 1)[0], 2.0, atol=1e-9)
-    assert np.isclose(np.polyfit(np.log(baseline), np.log(by_baseline), 1)[0], -1.0, atol=1e-9)
+@pytest.fixture
+def scene(x64, rng):
+    poses, point = cameras(rng, 5), np.array([0.8, -0.5, 6.0])
+    return poses, point, project(poses, point)
 
 
-def test_jacobian_of_the_thesis(x64):  # T-72
-    rig, (u_left, u_right, v) = kitti(), (640.0, 610.0, 200.0)
-    d, B, f, cx, cy = u_left - u_right, FOCAL_BASELINE / FOCAL, FOCAL, 607.19, 185.2
-    expected = [
-        [-B * (u_right - cx) / d**2, B * (u_left - cx) / d**2, 0.0],
-        [-B * (v - cy) / d**2, B * (v - cy) / d**2, B / d],
-        [-f * B / d**2, f * B / d**2, 0.0],
+def test_exact_pixels_meet_in_the_point(scene):
+    poses, point, pixels = scene
+    found = triangulate(jl.sensors.Pinhole(*CAMERA), poses, jnp.asarray(pixels))
+    assert bool(found.ok)
+    np.testing.assert_allclose(found.value, point, atol=1e-8)
+
+
+def test_equals_scipys_minimum_and_its_covariance(scene, rng):
+    poses, point, pixels = scene
+    pixels = pixels + SIGMA * rng.normal(size=pixels.shape)
+    found = triangulate(jl.sensors.Pinhole(*CAMERA), poses, jnp.asarray(pixels), sigma=SIGMA)
+    theirs = least_squares(lambda x: ((project(poses, x) - pixels) / SIGMA).ravel(), point, xtol=1e-14)
+    np.testing.assert_allclose(found.value, theirs.x, atol=1e-5)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(theirs.jac.T @ theirs.jac), rtol=1e-4)
+
+
+def test_consistency(scene, rng):
+    poses, point, pixels = scene
+    noisy = jnp.asarray(pixels + SIGMA * rng.normal(size=(400, *pixels.shape)))
+    found = jax.jit(jax.vmap(lambda p: triangulate(jl.sensors.Pinhole(*CAMERA), poses, p, sigma=SIGMA)))(noisy)
+    nees = jax.vmap(lambda f: f.gaussian().mahalanobis_squared(jnp.asarray(point)))(found)
+    # Mean 3, standard deviation sqrt(6 / 400) = 0.12.
+    assert bool(found.ok.all()) and 2.6 < nees.mean() < 3.4
+
+
+def test_midpoint_is_nearest_to_all_rays(scene, rng):
+    poses, _, _ = scene
+    rays = rng.normal(size=(5, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    centers = np.asarray(poses.translation)
+
+    def distances(x):
+        return np.cross(rays, x - centers).ravel()
+
+    theirs = least_squares(distances, np.zeros(3), xtol=1e-15, gtol=1e-15).x
+    np.testing.assert_allclose(midpoint(jnp.asarray(centers), jnp.asarray(rays)), theirs, atol=1e-8)
+    masked = midpoint(jnp.asarray(centers), jnp.asarray(rays).at[2].set(jnp.nan), valid=jnp.arange(5) != 2)
+    absent = midpoint(jnp.asarray(np.delete(centers, 2, 0)), jnp.asarray(np.delete(rays, 2, 0)))
+    np.testing.assert_allclose(masked, absent, atol=1e-12)
+
+
+def test_corrected_pairs_equal_opencv(x64, rng):
+    poses = cameras(rng, 2)
+    first, second = (jax.tree.map(lambda leaf, i=i: leaf[i], poses) for i in (0, 1))
+    K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+    T = first.inverse() @ second
+    x, y, z = np.asarray(T.translation)
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ np.asarray(T.rotation.matrix())
+    F = np.linalg.inv(K).T @ essential @ np.linalg.inv(K)
+    F /= np.linalg.norm(F)
+    points = np.column_stack([rng.uniform(-1, 2, (20, 2)), rng.uniform(4, 8, 20)])
+    pixels = np.stack([project(poses, point) for point in points]) + rng.normal(size=(20, 2, 2))
+    ours = jax.vmap(correct_pair, in_axes=(0, 0, None))(
+        jnp.asarray(pixels[:, 0]), jnp.asarray(pixels[:, 1]), jnp.asarray(F)
+    )
+    # OpenCV's convention is x2^T F x1 = 0.
+    theirs = cv2.correctMatches(F.T, pixels[None, :, 0], pixels[None, :, 1])
+    np.testing.assert_allclose(ours[0], theirs[0][0], atol=1e-3)
+    np.testing.assert_allclose(ours[1], theirs[1][0], atol=1e-3)
+    homogeneous = [np.column_stack([p, np.ones(20)]) for p in ours]
+    assert np.abs(np.einsum("ni,ij,nj->n", homogeneous[0], F, homogeneous[1])).max() < 1e-10
+
+
+def test_gradients_equal_differences(scene, rng):
+    poses, _, pixels = scene
+    pixels = jnp.asarray(pixels + SIGMA * rng.normal(size=pixels.shape))
+    find = jax.jit(lambda p: triangulate(jl.sensors.Pinhole(*CAMERA), poses, p).value)
+    slopes = jax.jit(jax.jacrev(find))(pixels)
+    steps = 1e-4 * np.eye(10).reshape(10, 5, 2)
+    differences = np.stack([(find(pixels + step) - find(pixels - step)) / 2e-4 for step in steps], axis=-1)
+    np.testing.assert_allclose(slopes.reshape(3, 10), differences, rtol=1e-4, atol=1e-7)
+
+
+def test_bad_geometry_is_not_believed(dtype, rng):
+    poses = jax.tree.map(lambda leaf: leaf.astype(dtype), cameras(rng, 5))
+    still = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], leaf.shape), poses)
+    camera = jl.sensors.Pinhole(*(jnp.asarray(v, dtype) for v in CAMERA))
+    good = jnp.asarray(project(poses, np.array([0.8, -0.5, 6.0])), dtype)
+    behind = jnp.asarray(project(poses, np.array([0.8, -0.5, -6.0])), dtype)
+    cases = [
+        (still, good),
+        (poses, behind),
+        (poses, jnp.full((5, 2), jnp.nan, dtype)),
+        (poses, good.at[1:].set(jnp.inf)),
     ]
-    assert np.allclose(stereo_jacobian(rig, jnp.array([u_left, u_right, v])), expected, rtol=1e-12)
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
 
+    def point_of(case):
+        found = triangulate(camera, *case)
+        return jnp.sum(found.value), found
 
-@pytest.mark.parametrize("skew", [0.0, 5.0])
-def test_jacobian_equals_differences(x64, skew):
-    rig, measurement = kitti(fy=650.0, skew=skew), jnp.array([700.0, 660.0, 120.0])
-    jacobian = stereo_jacobian(rig, measurement)
-    for i in range(3):
-        step = 1e-4 * jnp.eye(3)[i]
-        ends = rig.triangulate(jnp.stack([measurement + step, measurement - step]))
-        assert np.allclose(jacobian[:, i], (ends[0] - ends[1]) / 2e-4, atol=1e-8)
-
-
-@pytest.mark.parametrize("method", [Linear(), Unscented(), Sampled(20000)])
-def test_near_covariance_equals_monte_carlo(x64, rng, method):  # T-72
-    rig, noise = kitti(), jnp.diag(jnp.array([0.3, 0.3, 0.2]) ** 2)
-    measurement = rig.project(at(12.0, np.float64))[0]
-    point = stereo(rig, measurement, noise, method=method, key=jax.random.key(0))
-    u_left, u_right, v = rng.multivariate_normal(measurement, noise, 100000).T
-    z = FOCAL_BASELINE / (u_left - u_right)
-    draws = np.stack([z * (u_left - 607.19) / FOCAL, z * (v - 185.2) / FOCAL, z])
-    assert np.allclose(point.mean, draws.mean(1), atol=0.01)
-    assert np.linalg.norm(point.covariance - np.cov(draws)) < 0.03 * np.linalg.norm(np.cov(draws))
-
-
-def test_unscented_is_closer_in_depth_at_long_range(x64, rng):  # T-73
-    rig, noise = kitti(), 0.25 * jnp.eye(3)
-    measurement = rig.project(at(80.0, np.float64))[0]
-    depth = FOCAL_BASELINE / (FOCAL_BASELINE / 80.0 + 0.5 * 2**0.5 * rng.normal(size=400000))
-    linear, unscented = (stereo(rig, measurement, noise, method=m) for m in (Linear(), Unscented()))
-    assert abs(unscented.mean[2] - depth.mean()) < 0.2 * abs(linear.mean[2] - depth.mean())
-    errors = [abs(jnp.sqrt(p.covariance[2, 2]) - depth.std()) for p in (unscented, linear)]
-    assert errors[0] < 0.7 * errors[1]
-
-
-def test_coverage_of_the_methods_over_range(x64):  # T-73
-    rig, noise = kitti(), 0.25 * jnp.eye(3)
-    ranges = jnp.array([10.0, 100.0])
-
-    def held(method):
-        def one(z):
-            point = jnp.stack([0.1 * z, 0.05 * z, z])
-            return coverage(rig, point, noise, key=jax.random.key(0), method=method, num_trials=8000)
-
-        return np.asarray(jax.vmap(one)(ranges))
-
-    linear, unscented, sampled = held(Linear()), held(Unscented()), held(Sampled(64))
-    standard_error = (0.95 * 0.05 / 8000) ** 0.5
-    assert abs(linear[0] - 0.95) < 4 * standard_error and abs(unscented[0] - 0.95) < 4 * standard_error
-    assert linear[1] < 0.95 - 8 * standard_error  # the claimed ellipsoid is too small far away
-    assert linear[1] + 4 * standard_error < unscented[1]
-    # 64 samples estimate the covariance coarsely: their ellipsoid is a little too small near by, too.
-    assert 0.92 < sampled[0] < 0.95 and linear[1] < sampled[1]
-
-
-def test_gradient_vmap_and_eager(x64):
-    rig, noise = kitti(), 0.25 * jnp.eye(3)
-    measurements = rig.project(jnp.concatenate([at(8.0, np.float64), at(20.0, np.float64)]))
-    for method in (Linear(), Unscented(), Sampled(16)):
-
-        def total(measurement, method=method):
-            point = stereo(rig, measurement, noise, method=method, key=jax.random.key(1))
-            return point.mean.sum() + point.covariance.sum()
-
-        gradient = jax.grad(total)(measurements[0])
-        for i in range(3):
-            step = 1e-5 * jnp.eye(3)[i]
-            difference = (total(measurements[0] + step) - total(measurements[0] - step)) / 2e-5
-            assert np.isclose(gradient[i], difference, rtol=1e-5, atol=1e-7)
-        assert np.allclose(jax.vmap(total)(measurements), [total(m) for m in measurements])
-    with jax.disable_jit():
-        eager = stereo(rig, measurements[0], noise)
-    assert np.allclose(eager.covariance, stereo(rig, measurements[0], noise).covariance)
-
-
-def test_measurements_without_depth_stay_finite(dtype):
-    rig, noise = kitti(), 0.25 * jnp.eye(3, dtype=dtype)
-    for measurement in ([600.0, 600.0, 100.0], [600.0, 620.0, 100.0]):
-        for method in (Linear(), Unscented(), Sampled(16)):
-            point, pull = jax.vjp(
-                lambda m, method=method: stereo(rig, m, noise, method=method, key=jax.random.key(0)),
-                jnp.asarray(measurement, dtype),
-            )
-            assert all(np.isfinite(leaf).all() for leaf in (*jax.tree.leaves(point), *pull(point)))
-
-
-def test_sampling_needs_a_key():
-    with pytest.raises(ValueError, match="key"):
-        stereo(kitti(), jnp.array([640.0, 610.0, 200.0]), jnp.eye(3), method=Sampled())
+    (_, found), slopes = jax.jit(jax.vmap(jax.value_and_grad(point_of, has_aux=True, allow_int=True)))(together)
+    assert not found.ok.any() and found.value.dtype == dtype
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((found, slopes)))

@@ -8,8 +8,9 @@ import pytest
 
 from jaxloc.data.tracking import read_kitti_tracking, read_mot_detections, read_mot_tracks
 from jaxloc.evaluation import BoxOverlap, PointDistance, clear_mot, compare, hota
-from jaxloc.pipelines import detection_models, detection_tracking
-from jaxloc.pipelines.detection_tracking import Config, Phd, track
+from jaxloc.pipelines import detection_tracking
+from jaxloc.pipelines.detection_tracking import models
+from jaxloc.pipelines.detection_tracking.tracking import Config, Phd, track
 
 FRAMES, DT = 40, 0.1
 DOUBTFUL = 2  # the slot of what is false in the same place again and again
@@ -122,15 +123,15 @@ def test_bad_input_is_refused(street):
     with pytest.raises(ValueError, match="survival is 1.5"):
         Config(scene=dataclasses.replace(Config().scene, survival=1.5))
     with pytest.raises(ValueError, match="box is -1"):
-        Config(noise=detection_models.Noise(box=-1.0))
+        Config(noise=models.Noise(box=-1.0))
 
 
 def test_scores_are_evidence():
-    clutter = detection_models.ScoredClutter(5.0, 100.0, 2.0)
+    clutter = models.ScoredClutter(5.0, 100.0, 2.0)
     scores = jnp.linspace(0.0, 60.0, 6001)
     density = jnp.exp(jnp.stack([clutter.log_density(jnp.array([0.0, score])) for score in scores[::100]]))
     np.testing.assert_allclose(100.0 * np.trapezoid(density, scores[::100]), 1.0, rtol=0.03)
-    detection = detection_models.ScoredDetection(0.0, 0.4, 1)
+    detection = models.ScoredDetection(0.0, 0.4, 1)
     sure, doubtful = (float(detection.probability(jnp.array([0.0, score]))) for score in (12.0, 0.0))
     assert sure > 0.97 and doubtful == pytest.approx(0.5, abs=1e-6)
 

@@ -8,7 +8,7 @@ import pytest
 
 from jaxloc.data.simulate import floor
 from jaxloc.pipelines import floor_mosaic
-from jaxloc.pipelines.floor_mosaic import Config
+from jaxloc.pipelines.floor_mosaic.mosaic import Config
 from jaxloc.poses.planar import compose_poses, relative_poses
 
 SHAPE, HEIGHT, PIXEL = (160, 208), 0.045, 0.045 / (700.0 * 208 / 640)

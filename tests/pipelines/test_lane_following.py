@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import jaxloc as jl
-from jaxloc.alignment import ralph
-from jaxloc.alignment.ground_view import look
-from jaxloc.data.simulate.road import Road, render
-from jaxloc.data.simulate.road_drive import Course, drive
-from jaxloc.pipelines.lane_following import Config, Frame, LaneFollower, follow
-from jaxloc.pipelines.lane_pitch import estimate_pitch
+from jaxloc.data.simulate.road.drive import Course, drive
+from jaxloc.data.simulate.road.rendering import Road, render
+from jaxloc.lanes import ralph
+from jaxloc.lanes.ground_view import look
+from jaxloc.pipelines.lane_following.following import Config, Frame, LaneFollower, follow
+from jaxloc.pipelines.lane_following.pitch import estimate_pitch
 
 SHAPE = (240, 320)
 CONFIG = Config(sequence=True, interval=0.1)
@@ -92,7 +92,7 @@ def test_nothing_at_all_is_no_lane():
 
 
 def test_pictures_that_are_no_sequence_stand_for_themselves():
-    lanes = [jl.sensors.Lane(offset, 0.0, 0.0) for offset in (0.5, -0.5)]
+    lanes = [jl.lanes.Lane(offset, 0.0, 0.0) for offset in (0.5, -0.5)]
     pictures = [Picture(render(Road(shadows=None), lane, camera(), shape=SHAPE)) for lane in lanes]
     steps = list(follow(pictures, camera(), Config()))
     assert [step.source for step in steps] == ["start", "start"]

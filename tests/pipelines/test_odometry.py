@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jaxloc.data import kitti, simulate_street
+from jaxloc.odometry import MatchingOptions
 from jaxloc.pipelines import odometry
-from jaxloc.slam import MatchingOptions
 
 pytestmark = pytest.mark.heavy
 

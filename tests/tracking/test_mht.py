@@ -10,7 +10,7 @@ import pytest
 
 import jaxloc as jl
 from jaxloc.filters import run
-from jaxloc.tracking import mht, scan, tracks
+from jaxloc.tracking import likelihood_ratio, mht, tracks
 
 
 def make_model(intensity=0.01, variance=0.25, *, clutter=1.0, birth=0.01, detection=0.9):
@@ -51,7 +51,9 @@ def test_search_is_enumeration(rng):
     missed = jnp.asarray(np.log(rng.uniform(size=40)), jnp.float32)
     members = jnp.array([[0, 1, -1, 2, -1, -1], [3, -1, -1, -1, -1, -1]], jnp.int32)
     weights = jnp.log(jnp.array([0.7, 0.3]))
-    seen = eqx.filter_jit(scan.examine)(tracker.model, state.leaves, jnp.zeros((3, 2)), jnp.ones(3, bool), None)
+    seen = eqx.filter_jit(likelihood_ratio.examine)(
+        tracker.model, state.leaves, jnp.zeros((3, 2)), jnp.ones(3, bool), None
+    )
     seen = eqx.tree_at(lambda s: (s.log_odds, s.log_missed), seen, (odds, missed))
     state = mht.Hypotheses(state.leaves, state.paths, members, weights, state.step)
     search = eqx.filter_jit(mht.search)

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import jaxloc as jl
-from jaxloc.tracking import scan, tracks
+from jaxloc.tracking import likelihood_ratio, tracks
 
 
 def make_model(birth=None, detection=0.9):
@@ -115,7 +115,7 @@ def test_births_from_a_mixture_against_scipy():
     births = jl.tracking.StaticBirth(make_prior([0.1, 0.3]))
     model = make_model(births)
     z = np.array([[0.5, 1.0], [4.0, 6.0], [40.0, 60.0]])
-    newborn = eqx.filter_jit(scan.begin)(
+    newborn = eqx.filter_jit(likelihood_ratio.begin)(
         model, table([0.0]), jnp.asarray(z, jnp.float32), jnp.array([True, True, False])
     )
     means, cov = np.asarray(births.intensity.means), 5.0 * np.eye(2)
@@ -130,18 +130,18 @@ def test_births_from_a_mixture_against_scipy():
 
 def test_births_from_measurements_and_none():
     z, there = jnp.ones((2, 2)), jnp.array([True, False])
-    newborn = eqx.filter_jit(scan.begin)(make_model(), table([0.0]), z, there)
+    newborn = eqx.filter_jit(likelihood_ratio.begin)(make_model(), table([0.0]), z, there)
     assert float(newborn.log_intensity[0]) == pytest.approx(np.log(0.2 / 1e4), rel=1e-5)
     assert newborn.log_intensity[1] == -jnp.inf and float(newborn.expected) == pytest.approx(0.2)
     np.testing.assert_allclose(newborn.states.mean[0], [1.0, 1.0, 0.0, 0.0])
-    nobody = eqx.filter_jit(scan.begin)(make_model(jl.tracking.Birth()), table([0.0]), z, there)
+    nobody = eqx.filter_jit(likelihood_ratio.begin)(make_model(jl.tracking.Birth()), table([0.0]), z, there)
     assert jnp.all(nobody.log_intensity == -jnp.inf) and float(nobody.expected) == 0.0
 
 
 def test_odds_against_scipy():
     model, before = make_model(), table([0.8, 0.0])
     z = np.array([[1.0, 0.0], [np.nan, 0.0], [500.0, 0.0]], np.float32)
-    seen = eqx.filter_jit(scan.examine)(model, before, jnp.asarray(z), jnp.ones(3, bool), 0.999)
+    seen = eqx.filter_jit(likelihood_ratio.examine)(model, before, jnp.asarray(z), jnp.ones(3, bool), 0.999)
     assert seen.there.tolist() == [True, False, True]
     density = multivariate_normal.pdf(z[0], before.means()[0, :2], 5.0 * np.eye(2))
     expected = np.log(0.8 * 0.9 * density / (2.2 / 1e4))

@@ -1,33 +1,23 @@
-"""Signals to pose: pictures laid upon each other."""
+"""Image alignment and point tracking from gray levels."""
 
 from jaxloc.alignment import (
     correlation,
-    departure,
-    dickmanns,
     ecc,
-    ground_view,
+    klt,
     lucas_kanade,
-    mosaic,
     multi_start,
     mutual_information,
-    phase,
+    phase_correlation,
     plane_pose,
-    ralph,
-    tracker,
 )
 
 __all__ = [
     "correlation",
-    "departure",
-    "dickmanns",
     "ecc",
-    "ground_view",
+    "klt",
     "lucas_kanade",
-    "mosaic",
     "multi_start",
     "mutual_information",
-    "phase",
+    "phase_correlation",
     "plane_pose",
-    "ralph",
-    "tracker",
 ]

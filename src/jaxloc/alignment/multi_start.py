@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc.alignment.lucas_kanade.align import estimate, search, start_of, take
-from jaxloc.alignment.lucas_kanade.conclusion import Evidence
-from jaxloc.alignment.lucas_kanade.descend import Descended
-from jaxloc.alignment.lucas_kanade.equations import Prepared, equations, zero_brightness
-from jaxloc.alignment.lucas_kanade.level import Level
-from jaxloc.alignment.lucas_kanade.settings import LucasKanade
+from jaxloc.alignment.lucas_kanade.covariance import Evidence
+from jaxloc.alignment.lucas_kanade.iteration import Descended
+from jaxloc.alignment.lucas_kanade.normal_equations import Prepared, equations, zero_brightness
+from jaxloc.alignment.lucas_kanade.options import LucasKanade
+from jaxloc.alignment.lucas_kanade.pyramid_level import Level
 from jaxloc.images.warps import Translation, Warp
 from jaxloc.solvers import Estimate
 

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc.images.interpolation import Bicubic, sample_components
-from jaxloc.images.normalize import as_grey
+from jaxloc.images.normalization import as_grey
 from jaxloc.images.pyramid import gaussian_pyramid
 from jaxloc.poses import SE3
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors import Pinhole, TexturedPlane
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Problem, Quadratic, solve
-from jaxloc.solvers.linear import factor
+from jaxloc.solvers.cholesky import factor
 
 
 class Appearance(eqx.Module):

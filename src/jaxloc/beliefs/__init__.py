@@ -1,29 +1,27 @@
-"""How surely we know: Gaussians on any state, and how uncertainty passes through functions and gates."""
+"""Probability densities on any pytree: Gaussians, mixtures and particles; propagation, gates and resampling."""
 
 from jaxloc.beliefs import (
-    adaptive,
     compounding,
-    conditional,
-    fixed_point,
     gates,
     gaussian,
+    kld_sampling,
     mixture,
+    mixture_reduction,
+    models,
     particles,
     propagation,
-    reduction,
     resampling,
-    squareroot,
-    transport,
+    square_root,
 )
-from jaxloc.beliefs.adaptive import KLDSize
 from jaxloc.beliefs.compounding import compose, invert, relative
-from jaxloc.beliefs.conditional import Motion, Sensor
 from jaxloc.beliefs.gates import chi2_cdf, chi2_quantile, gate
 from jaxloc.beliefs.gaussian import Gaussian, fuse
+from jaxloc.beliefs.kld_sampling import KLDSize
 from jaxloc.beliefs.mixture import Mixture
+from jaxloc.beliefs.mixture_reduction import Closeness, KullbackLeibler, MahalanobisDistance, reduce_mixture
+from jaxloc.beliefs.models import Motion, Sensor
 from jaxloc.beliefs.particles import Particles
 from jaxloc.beliefs.propagation import propagate_linear, propagate_sampled, propagate_unscented
-from jaxloc.beliefs.reduction import Closeness, KullbackLeibler, MahalanobisDistance, reduce_mixture
 
 __all__ = [
     "Closeness",
@@ -35,28 +33,26 @@ __all__ = [
     "Motion",
     "Particles",
     "Sensor",
-    "adaptive",
     "chi2_cdf",
     "chi2_quantile",
     "compose",
     "compounding",
-    "conditional",
-    "fixed_point",
     "fuse",
     "gate",
     "gates",
     "gaussian",
     "invert",
+    "kld_sampling",
     "mixture",
+    "mixture_reduction",
+    "models",
     "particles",
     "propagate_linear",
     "propagate_sampled",
     "propagate_unscented",
     "propagation",
     "reduce_mixture",
-    "reduction",
     "relative",
     "resampling",
-    "squareroot",
-    "transport",
+    "square_root",
 ]

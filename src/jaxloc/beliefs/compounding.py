@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array
 
 from jaxloc.beliefs.gaussian import Gaussian
-from jaxloc.poses.group import Group, matmul
+from jaxloc.poses.lie_group import Group, matmul
 
 
 @eqx.filter_jit

@@ -9,7 +9,7 @@ from jax import lax
 from jax.scipy.special import gammainc, gammaincc, gammaln, ndtri
 from jaxtyping import Array, Bool, Float
 
-from jaxloc.poses.group import as_floats
+from jaxloc.poses.lie_group import as_floats
 
 _NEWTON_STEPS = 12
 

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from jaxloc.beliefs.conditional import dtype_of
 from jaxloc.beliefs.gaussian import Gaussian
+from jaxloc.beliefs.models import dtype_of
 from jaxloc.poses import SE2, SE3, SO2, SO3, local, retract
-from jaxloc.poses.group import Group, matmul
+from jaxloc.poses.lie_group import Group, matmul
 
 NOTHING = -1e30  # log weight of a particle without weight: finite, so that sums and gradients of it are
 _SQUARINGS = 5

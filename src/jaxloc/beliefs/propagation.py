@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from jaxloc.beliefs.gaussian import Gaussian
-from jaxloc.beliefs.squareroot import cholesky
+from jaxloc.beliefs.square_root import cholesky
 from jaxloc.poses import is_flat, local, retract
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 
 _MEAN_STEPS = 3  # of the intrinsic mean on a manifold; the error shrinks as the square of the spread each time
 

@@ -28,7 +28,7 @@ def run(arguments: list[str]) -> int:
         The exit code: 0, 2 after bad input, 130 after an interrupt.
     """
     try:
-        from jaxloc.cli.commands import app
+        from jaxloc.cli.app import app
     except ImportError as error:
         return _fail(f'the command line needs {error.name}: pip install "jaxloc[cli]"')
     try:

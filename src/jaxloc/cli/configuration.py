@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxloc.data import DataError
-from jaxloc.data.tables import read_text
+from jaxloc.data.io.text import read_text
 
 
 def load_yaml() -> Any:

@@ -7,7 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import jaxloc
 from jaxloc.cli import configuration, session
-from jaxloc.data.writing import write_file
+from jaxloc.data.io.writing import write_file
 from jaxloc.evaluation import report
 
 

@@ -1,30 +1,29 @@
-"""Files and synthetic worlds that give the library's own records."""
+"""Readers and writers of files, and simulators with ground truth."""
 
 from jaxloc.data import (
-    bundle,
     camera_file,
     carmen,
     covariance,
+    gtsam_stereo,
+    io,
     kitti,
     landmarks,
-    lanes,
     laser_log,
-    maps,
-    png,
-    sequence,
+    road_images,
+    ros_map,
     simulate,
-    tables,
+    stereo_sequence,
     tracking,
     tum,
     wean,
-    writing,
 )
+from jaxloc.data.io.errors import DataError
 from jaxloc.data.kitti import KittiSequence
 from jaxloc.data.laser_log import LaserLog
-from jaxloc.data.sequence import DataError, StereoFrame, StereoSequence
-from jaxloc.data.simulate.camera import StreetSequence, simulate_street
 from jaxloc.data.simulate.laser import LaserDrive, simulate_laser_drive
-from jaxloc.data.simulate.points import StereoDrive, StereoPairs, simulate_stereo_points
+from jaxloc.data.simulate.stereo_points import StereoDrive, StereoPairs, simulate_stereo_points
+from jaxloc.data.simulate.street.sequence import StreetSequence, simulate_street
+from jaxloc.data.stereo_sequence import StereoFrame, StereoSequence
 
 __all__ = [
     "DataError",
@@ -36,24 +35,22 @@ __all__ = [
     "StereoPairs",
     "StereoSequence",
     "StreetSequence",
-    "bundle",
     "camera_file",
     "carmen",
     "covariance",
+    "gtsam_stereo",
+    "io",
     "kitti",
     "landmarks",
-    "lanes",
     "laser_log",
-    "maps",
-    "png",
-    "sequence",
+    "road_images",
+    "ros_map",
     "simulate",
     "simulate_laser_drive",
     "simulate_stereo_points",
     "simulate_street",
-    "tables",
+    "stereo_sequence",
     "tracking",
     "tum",
     "wean",
-    "writing",
 ]

@@ -26,9 +26,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float64
 
-from jaxloc.data.sequence import DataError
-from jaxloc.data.tables import read_text
-from jaxloc.data.writing import write_file
+from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.text import read_text
+from jaxloc.data.io.writing import write_file
 from jaxloc.sensors import BrownConrady, KannalaBrandt, Pinhole
 
 _MATRIX_KEYS = ("camera_matrix", "M1", "M")

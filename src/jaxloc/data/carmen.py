@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxloc.data.io.errors import DataError
 from jaxloc.data.laser_log import LaserLog
-from jaxloc.data.sequence import DataError
 from jaxloc.poses.planar import relative_poses
 
 _LONGEST_LINE = 1 << 20

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from jaxloc.data.sequence import DataError
-from jaxloc.data.tables import parse_numbers, read_text
+from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.text import parse_numbers, read_text
 
 _AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 HEADER = (

@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from jaxloc.data.png import read_image, read_size, verify_image
-from jaxloc.data.sequence import DataError, StereoFrame
-from jaxloc.data.tables import check_increasing, check_rotations, parse_numbers, read_rows, read_text
-from jaxloc.data.writing import write_file
+from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.png import read_image, read_size, verify_image
+from jaxloc.data.io.text import check_increasing, check_rotations, parse_numbers, read_rows, read_text
+from jaxloc.data.io.writing import write_file
+from jaxloc.data.stereo_sequence import StereoFrame
 from jaxloc.poses import Trajectory
 from jaxloc.sensors import Pinhole, StereoRig
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from jaxloc.data.sequence import DataError
-from jaxloc.data.tables import check_increasing, read_rows
-from jaxloc.data.writing import write_file
+from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.text import check_increasing, read_rows
+from jaxloc.data.io.writing import write_file
 from jaxloc.poses import Trajectory
 
 

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxloc.data.carmen import increasing, read_lines
+from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.text import parse_numbers
 from jaxloc.data.laser_log import LaserLog
-from jaxloc.data.sequence import DataError
-from jaxloc.data.tables import parse_numbers
 from jaxloc.poses import SE2
 from jaxloc.poses.planar import relative_poses
 from jaxloc.sensors import OccupancyMap

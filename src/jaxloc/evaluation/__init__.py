@@ -1,25 +1,13 @@
-"""Metrics, plots and reports."""
+"""Metrics, figures and reports."""
 
-from jaxloc.evaluation import (
-    alignments,
-    consistency,
-    drift,
-    identities,
-    plot,
-    plot_map,
-    plot_objects,
-    plot_tracks,
-    report,
-    targets,
-    trajectories,
-    update_rate,
-)
-from jaxloc.evaluation.alignments import NoAlignment, RigidAlignment, SimilarityAlignment
-from jaxloc.evaluation.drift import SegmentErrors, end_drift_percent, segment_errors
-from jaxloc.evaluation.identities import BoxOverlap, PointDistance, clear_mot, compare, hota, id_f1
+from jaxloc.evaluation import consistency, plots, report, targets, trajectories, update_rate
 from jaxloc.evaluation.report import Section
-from jaxloc.evaluation.targets import Gospa, Ospa, gospa, ospa, ospa2
-from jaxloc.evaluation.trajectories import Frames, Meters, ate, rpe
+from jaxloc.evaluation.targets.mot_metrics import BoxOverlap, PointDistance, clear_mot, compare, hota, id_f1
+from jaxloc.evaluation.targets.ospa import Gospa, Ospa, gospa, ospa, ospa2
+from jaxloc.evaluation.trajectories.alignment import NoAlignment, RigidAlignment, SimilarityAlignment
+from jaxloc.evaluation.trajectories.ate import ate
+from jaxloc.evaluation.trajectories.kitti_drift import SegmentErrors, end_drift_percent, segment_errors
+from jaxloc.evaluation.trajectories.rpe import Frames, Meters, rpe
 
 __all__ = [
     "BoxOverlap",
@@ -33,23 +21,17 @@ __all__ = [
     "Section",
     "SegmentErrors",
     "SimilarityAlignment",
-    "alignments",
     "ate",
     "clear_mot",
     "compare",
     "consistency",
-    "drift",
     "end_drift_percent",
     "gospa",
     "hota",
     "id_f1",
-    "identities",
     "ospa",
     "ospa2",
-    "plot",
-    "plot_map",
-    "plot_objects",
-    "plot_tracks",
+    "plots",
     "report",
     "rpe",
     "segment_errors",

@@ -119,7 +119,7 @@ def trajectory_nees(estimate: Trajectory, covariances: Float[Array, "n d d"], tr
 
     Example:
         >>> import jaxloc as jl
-        >>> path = jl.data.simulate.points.simulate_drive(3, key=jax.random.key(0))
+        >>> path = jl.data.simulate.stereo_points.simulate_drive(3, key=jax.random.key(0))
         >>> trajectory_nees(path, jnp.tile(jnp.eye(6), (3, 1, 1)), path).ok.tolist()
         [True, True, True]
     """

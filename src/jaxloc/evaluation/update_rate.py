@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from jaxloc.poses.group import as_floats
+from jaxloc.poses.lie_group import as_floats
 
 
 class Combination(eqx.Module):

@@ -1,30 +1,28 @@
-"""One estimate carried through time: Bayes filters as pure steps, and smoothers."""
+"""Bayes filters and smoothers: the Kalman family, particle filters, histogram filters, interacting models."""
 
 from jaxloc.filters import (
-    blocks,
-    contract,
     extended,
-    grid,
+    histogram,
     information,
+    interacting_models,
+    interface,
     kalman,
     localization,
-    modes,
-    motion,
+    motion_models,
     parallel,
     particle,
     proposals,
-    rao_blackwell,
     smoothers,
     unscented,
 )
-from jaxloc.filters.contract import Filter, FilterState, GaussianInfo, GaussianState, History, Info, run
 from jaxloc.filters.extended import ExtendedKalmanFilter
-from jaxloc.filters.grid import GridFilter, GridInfo, GridState
+from jaxloc.filters.histogram import GridFilter, GridInfo, GridState
 from jaxloc.filters.information import InformationFilter, InformationInfo, InformationState
+from jaxloc.filters.interacting_models import InteractingFilters, ModesInfo, ModesState, smooth_modes
+from jaxloc.filters.interface import Filter, FilterState, GaussianInfo, GaussianState, History, Info, run
 from jaxloc.filters.kalman import GaussianFilter, KalmanFilter, LinearSensor
 from jaxloc.filters.localization import LocalizationInfo, LocalizationState, MonteCarloLocalization, Place, Recovery
-from jaxloc.filters.modes import InteractingFilters, ModesInfo, ModesState, smooth_modes
-from jaxloc.filters.motion import (
+from jaxloc.filters.motion_models import (
     BodyTwist,
     ConstantAcceleration,
     ConstantVelocity,
@@ -32,15 +30,13 @@ from jaxloc.filters.motion import (
     LinearMotion,
     TwistMotion,
 )
-from jaxloc.filters.parallel import run_parallel, smooth_parallel
+from jaxloc.filters.parallel.gaussian import run_parallel, smooth_parallel
 from jaxloc.filters.particle import ParticleFilter, ParticleInfo, ParticleState
 from jaxloc.filters.proposals import Auxiliary, Bootstrap, Guided
-from jaxloc.filters.rao_blackwell import Appearance, DescriptorFastSlam, FastSlam, FastSlamInfo, FastSlamState
 from jaxloc.filters.smoothers import smooth, smooth_fixed_lag
 from jaxloc.filters.unscented import Cubature, GaussHermite, SigmaPointFilter, Unscented
 
 __all__ = [
-    "Appearance",
     "Auxiliary",
     "BodyTwist",
     "Bootstrap",
@@ -48,11 +44,7 @@ __all__ = [
     "ConstantVelocity",
     "CoordinatedTurn",
     "Cubature",
-    "DescriptorFastSlam",
     "ExtendedKalmanFilter",
-    "FastSlam",
-    "FastSlamInfo",
-    "FastSlamState",
     "Filter",
     "FilterState",
     "GaussHermite",
@@ -85,19 +77,17 @@ __all__ = [
     "SigmaPointFilter",
     "TwistMotion",
     "Unscented",
-    "blocks",
-    "contract",
     "extended",
-    "grid",
+    "histogram",
     "information",
+    "interacting_models",
+    "interface",
     "kalman",
     "localization",
-    "modes",
-    "motion",
+    "motion_models",
     "parallel",
     "particle",
     "proposals",
-    "rao_blackwell",
     "run",
     "run_parallel",
     "smooth",

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc.beliefs import Motion, Sensor
-from jaxloc.beliefs.conditional import innovation
-from jaxloc.beliefs.squareroot import product, whiten
-from jaxloc.filters.contract import GaussianInfo, GaussianState
+from jaxloc.beliefs.models import innovation
+from jaxloc.beliefs.square_root import product, whiten
+from jaxloc.filters.interface import GaussianInfo, GaussianState
 from jaxloc.filters.kalman import (
     GaussianFilter,
     Reading,
@@ -23,7 +23,7 @@ from jaxloc.filters.kalman import (
     spread_reading,
 )
 from jaxloc.poses import carry, is_flat, retract
-from jaxloc.solvers.robust import Loss, Quadratic
+from jaxloc.solvers.robust_kernels import Loss, Quadratic
 
 _SMALLEST_WEIGHT = 1e-8  # of a robust kernel: the noise of a rejected measurement grows by ten thousand
 

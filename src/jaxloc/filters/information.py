@@ -8,11 +8,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc.beliefs import Gaussian, Motion, Sensor
-from jaxloc.beliefs.conditional import innovation
-from jaxloc.beliefs.squareroot import cholesky, solve, triangularize, whiten
-from jaxloc.filters.contract import Filter, FilterState, GaussianState, Info
+from jaxloc.beliefs.models import innovation
+from jaxloc.beliefs.square_root import cholesky, solve, triangularize, whiten
+from jaxloc.filters.interface import Filter, FilterState, GaussianState, Info
 from jaxloc.filters.kalman import finite_or_zero, noise_root, select
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 
 
 class InformationState(FilterState):

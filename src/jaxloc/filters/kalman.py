@@ -17,9 +17,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc.beliefs import Gaussian, Motion, Sensor, chi2_quantile
-from jaxloc.beliefs.conditional import innovation, mask_covariance
-from jaxloc.beliefs.squareroot import cholesky, downdate, product, triangularize, whiten
-from jaxloc.filters.contract import Filter, GaussianInfo, GaussianState
+from jaxloc.beliefs.models import innovation, mask_covariance
+from jaxloc.beliefs.square_root import cholesky, downdate, product, triangularize, whiten
+from jaxloc.filters.interface import Filter, GaussianInfo, GaussianState
 from jaxloc.poses import carry, is_flat, retract
 
 

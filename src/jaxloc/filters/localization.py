@@ -11,10 +11,11 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc.beliefs import Gaussian, KLDSize, Motion, Particles, Sensor
 from jaxloc.beliefs.particles import finite_log_weights
-from jaxloc.beliefs.resampling import Resampling, Systematic, systematic
-from jaxloc.filters.contract import Filter, FilterState, Info
+from jaxloc.beliefs.resampling.indices import systematic
+from jaxloc.beliefs.resampling.strategies import Resampling, Systematic
+from jaxloc.filters.interface import Filter, FilterState, Info
 from jaxloc.poses import SE2
-from jaxloc.sensors.maps import FreeSpace
+from jaxloc.sensors.maps.occupancy_map import FreeSpace
 
 _SLOTS = 4096  # of the table in which poses are counted by place
 _HALVINGS = 12

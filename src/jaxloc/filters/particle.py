@@ -11,10 +11,10 @@ from jax.sharding import AxisType
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc.beliefs import Motion, Particles, Sensor
-from jaxloc.beliefs.adaptive import KLDSize
+from jaxloc.beliefs.kld_sampling import KLDSize
 from jaxloc.beliefs.particles import NOTHING
-from jaxloc.beliefs.resampling import Resampling, Systematic
-from jaxloc.filters.contract import Filter, FilterState, Info
+from jaxloc.beliefs.resampling.strategies import Resampling, Systematic
+from jaxloc.filters.interface import Filter, FilterState, Info
 from jaxloc.filters.proposals import Bootstrap, Choice, Draft, Proposal, Reading, score
 from jaxloc.poses import local, retract
 

@@ -11,11 +11,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc.beliefs import Motion, Particles, Sensor
-from jaxloc.beliefs.conditional import dtype_of, innovation, log_normal, mask_covariance
+from jaxloc.beliefs.models import dtype_of, innovation, log_normal, mask_covariance
 from jaxloc.beliefs.particles import NOTHING
-from jaxloc.beliefs.squareroot import cholesky, whiten
+from jaxloc.beliefs.square_root import cholesky, whiten
 from jaxloc.poses import local, retract, tangent_dimension
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 
 
 class Draft(eqx.Module):

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxloc.beliefs.squareroot import product, triangularize, whiten
-from jaxloc.filters.contract import GaussianState, History
+from jaxloc.beliefs.square_root import product, triangularize, whiten
+from jaxloc.filters.interface import GaussianState, History
 from jaxloc.filters.kalman import GaussianFilter, finite_or_zero, recenter, select
 from jaxloc.poses import carry, is_flat, local
 

@@ -14,9 +14,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc.beliefs import Motion, Sensor
-from jaxloc.beliefs.conditional import innovation
-from jaxloc.beliefs.squareroot import cholesky, product
-from jaxloc.filters.contract import GaussianState
+from jaxloc.beliefs.models import innovation
+from jaxloc.beliefs.square_root import cholesky, product
+from jaxloc.filters.interface import GaussianState
 from jaxloc.filters.kalman import GaussianFilter, Reading, Spread, noise_root
 from jaxloc.poses import is_flat, local, retract
 

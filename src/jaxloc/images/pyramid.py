@@ -3,7 +3,7 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxloc.images.apart import apart
+from jaxloc._xla import compute_once
 from jaxloc.images.gradients import pad_reflected
 
 _BINOMIAL = (1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0)
@@ -29,7 +29,7 @@ def halve(image: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
         >>> halve(jnp.ones((7, 10))).shape
         (4, 5)
     """
-    return apart(_halve_columns, apart(_halve_rows, image))
+    return compute_once(_halve_columns, compute_once(_halve_rows, image))
 
 
 @eqx.filter_jit

@@ -4,21 +4,19 @@ from jaxloc.multiview import (
     disparity,
     epipolar,
     five_point,
-    fundamental,
+    fundamental_matrix,
     homography,
-    intersection,
-    minimal,
     planar_motion,
     rectification,
+    stereo_triangulation,
     triangulation,
     two_view,
     upright,
 )
 from jaxloc.multiview.epipolar import RelativePose
 from jaxloc.multiview.homography import estimate_homography
-from jaxloc.multiview.intersection import intersect
-from jaxloc.multiview.minimal import MinimalPoses, p3p
-from jaxloc.multiview.triangulation import Linear, Sampled, TriangulationMethod, Unscented, coverage, stereo
+from jaxloc.multiview.p3p import MinimalPoses, p3p
+from jaxloc.multiview.stereo_triangulation import Linear, Sampled, TriangulationMethod, Unscented, coverage
 from jaxloc.multiview.two_view import ConsensusOptions, estimate_relative_pose
 
 __all__ = [
@@ -35,15 +33,12 @@ __all__ = [
     "estimate_homography",
     "estimate_relative_pose",
     "five_point",
-    "fundamental",
+    "fundamental_matrix",
     "homography",
-    "intersect",
-    "intersection",
-    "minimal",
     "p3p",
     "planar_motion",
     "rectification",
-    "stereo",
+    "stereo_triangulation",
     "triangulation",
     "two_view",
     "upright",

@@ -9,7 +9,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
-from jaxloc.images import opencv, subpixel
+from jaxloc.features import subpixel
+from jaxloc.features.opencv import library
 
 # Cost where a window leaves the other picture.
 _OUTSIDE = 1e9
@@ -185,7 +186,7 @@ class SemiGlobal(Matcher):
             ImportError: OpenCV is not installed.
         """
         penalty = self.size**2
-        matcher = opencv.load().StereoSGBM_create(
+        matcher = library.load().StereoSGBM_create(
             minDisparity=0,
             numDisparities=self.num_disparities,
             blockSize=self.size,
@@ -196,7 +197,7 @@ class SemiGlobal(Matcher):
             speckleWindowSize=100,
             speckleRange=2,
         )
-        found = matcher.compute(opencv.grey_bytes(left), opencv.grey_bytes(right)).astype(np.float32) / 16.0
+        found = matcher.compute(library.grey_bytes(left), library.grey_bytes(right)).astype(np.float32) / 16.0
         valid = found > 0
         variance = np.where(valid, self.sigma**2, 1.0).astype(np.float32)
         return DisparityMap(jnp.asarray(np.where(valid, found, 0.0)), jnp.asarray(variance), jnp.asarray(valid))

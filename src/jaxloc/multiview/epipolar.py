@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc.poses import SE3, SO3, Direction
-from jaxloc.poses.group import matmul, skew
+from jaxloc.poses.lie_group import matmul, skew
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Problem, Quadratic
 
@@ -50,7 +50,7 @@ def fundamental(essential: Float[Array, "3 3"], first: Pinhole, second: Pinhole)
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> camera = jl.sensors.Pinhole(100.0, 100.0, 50.0, 50.0)
-        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> sideways = jl.poses.lie_group.skew(jnp.array([1.0, 0.0, 0.0]))
         >>> jl.multiview.epipolar.fundamental(sideways, camera, camera).round(2).tolist()[2]
         [0.0, 0.7099999785423279, 0.0]
     """
@@ -76,7 +76,7 @@ def epipolar_lines(matrix: Float[Array, "3 3"], second: Float[Array, "n 2"]) -> 
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
-        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> sideways = jl.poses.lie_group.skew(jnp.array([1.0, 0.0, 0.0]))
         >>> jl.multiview.epipolar.epipolar_lines(sideways, jnp.array([[5.0, 3.0]])).tolist()  # v = 3
         [[0.0, -1.0, 3.0]]
     """
@@ -100,7 +100,7 @@ def epipoles(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Arra
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
-        >>> ahead = jl.poses.group.skew(jnp.array([0.0, 0.0, 1.0]))
+        >>> ahead = jl.poses.lie_group.skew(jnp.array([0.0, 0.0, 1.0]))
         >>> [jnp.abs(e).round(3).tolist() for e in jl.multiview.epipolar.epipoles(ahead)]
         [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]
     """
@@ -154,7 +154,7 @@ def coplanarity(
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
-        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> sideways = jl.poses.lie_group.skew(jnp.array([1.0, 0.0, 0.0]))
         >>> jl.multiview.epipolar.coplanarity(sideways, jnp.array([[2.0, 3.0]]), jnp.array([[5.0, 3.0]])).tolist()
         [0.0]
     """
@@ -186,7 +186,7 @@ def sampson_distance(
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
-        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> sideways = jl.poses.lie_group.skew(jnp.array([1.0, 0.0, 0.0]))
         >>> off = jl.multiview.epipolar.sampson_distance(sideways, jnp.array([[2.0, 3.0]]), jnp.array([[5.0, 4.0]]))
         >>> round(abs(float(off[0])), 3)  # half a pixel each: sqrt(1/2) for both
         0.707
@@ -205,7 +205,7 @@ def symmetric_distance(
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
-        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> sideways = jl.poses.lie_group.skew(jnp.array([1.0, 0.0, 0.0]))
         >>> off = jl.multiview.epipolar.symmetric_distance(sideways, jnp.array([[2.0, 3.0]]), jnp.array([[5.0, 4.0]]))
         >>> round(float(off[0]), 3)
         1.414
@@ -234,7 +234,7 @@ def epipolar_gate(
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
-        >>> sideways = jl.poses.group.skew(jnp.array([1.0, 0.0, 0.0]))
+        >>> sideways = jl.poses.lie_group.skew(jnp.array([1.0, 0.0, 0.0]))
         >>> points = jnp.array([[2.0, 3.0], [7.0, 30.0]])
         >>> jl.multiview.epipolar.epipolar_gate(sideways, points, points[::-1]).tolist()
         [[False, True], [True, False]]

@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc.multiview.epipolar import RelativePose, depth_signs, null_vector, unit_rays
 from jaxloc.poses import SO3, Direction, retract
-from jaxloc.poses.group import matmul, skew
-from jaxloc.solvers.linear import factor
+from jaxloc.poses.lie_group import matmul, skew
+from jaxloc.solvers.cholesky import factor
 
 _ROOT_STEPS = 25
 _POLISH_STEPS = 3

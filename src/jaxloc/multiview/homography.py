@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc.images import Homography
 from jaxloc.poses import SE3, Direction
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Loss, Problem, Quadratic, Tukey, ransac, solve
 

@@ -9,7 +9,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc.multiview.epipolar import depth_signs, unit_rays
-from jaxloc.multiview.minimal import MinimalPoses
+from jaxloc.multiview.p3p import MinimalPoses
 from jaxloc.poses import SE3, SO3
 
 _POLISH_STEPS = 4

@@ -7,9 +7,9 @@ from jaxtyping import Array, Bool, Float
 from jaxloc.images import Homography
 from jaxloc.multiview.epipolar import null_vector
 from jaxloc.poses import SE3, SO3
-from jaxloc.poses.group import matmul, skew
+from jaxloc.poses.lie_group import matmul, skew
 from jaxloc.sensors import Pinhole, StereoRig
-from jaxloc.solvers.linear import factor
+from jaxloc.solvers.cholesky import factor
 
 
 class Rectification(eqx.Module):

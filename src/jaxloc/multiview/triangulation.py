@@ -1,191 +1,204 @@
-"""Points from stereo measurements, with their covariance."""
+"""Points where the rays of several cameras meet: closed forms, and the most likely point with its covariance."""
 
-from abc import abstractmethod
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float
 
-from jaxloc.beliefs import Gaussian, gate, propagate_sampled, propagate_unscented
-from jaxloc.beliefs.squareroot import cholesky
-from jaxloc.poses.group import matmul
-from jaxloc.sensors import StereoRig
+from jaxloc.poses import SE3
+from jaxloc.poses.lie_group import matmul
+from jaxloc.sensors import Pinhole
+from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Loss, Problem, Quadratic, solve
+from jaxloc.solvers.cholesky import factor
 
-
-class TriangulationMethod(eqx.Module):
-    """How pixel noise becomes the covariance of a point."""
-
-    @abstractmethod
-    def triangulate(self, rig: StereoRig, measured: Gaussian, key: Key[Array, ""] | None) -> Gaussian:
-        """Density of the point in the left camera's frame for the density of (u_left, u_right, v)."""
-
-
-class Linear(TriangulationMethod):
-    """First order: ``J R J^T`` with the analytic Jacobian; right while sigma_d / d stays below about 0.1."""
-
-    def triangulate(self, rig: StereoRig, measured: Gaussian, key: Key[Array, ""] | None) -> Gaussian:
-        """Point and ``J R J^T``."""
-        point = rig.triangulate(measured.mean[None])[0]
-        jacobian = stereo_jacobian(rig, measured.mean)
-        return Gaussian(point, matmul(matmul(jacobian, measured.covariance), jacobian.T))
-
-
-class Unscented(TriangulationMethod):
-    """Seven sigma points; the default weights are those of `propagate_unscented`."""
-
-    alpha: float = eqx.field(static=True, default=1.0)
-    beta: float = eqx.field(static=True, default=0.0)
-    kappa: float | None = eqx.field(static=True, default=None)
-
-    def triangulate(self, rig: StereoRig, measured: Gaussian, key: Key[Array, ""] | None) -> Gaussian:
-        """Moments of the sigma points."""
-        options = {"alpha": self.alpha, "beta": self.beta, "kappa": self.kappa}
-        return propagate_unscented(_PointOf(rig), measured, **options)
-
-
-class Sampled(TriangulationMethod):
-    """Moments of random samples; `stereo` then needs a key."""
-
-    num_samples: int = eqx.field(static=True, default=256)
-
-    def triangulate(self, rig: StereoRig, measured: Gaussian, key: Key[Array, ""] | None) -> Gaussian:
-        """Moments of the samples."""
-        if key is None:
-            raise ValueError("triangulation by Sampled() draws random numbers: give key=jax.random.key(...).")
-        return propagate_sampled(_PointOf(rig), measured, key=key, num_samples=self.num_samples)
-
-
-_LINEAR = Linear()
+# Residual, in sigmas, of a point that a camera has behind it.
+_UNSEEN = 1e3
 
 
 @eqx.filter_jit
-def stereo(
-    rig: StereoRig,
-    measurement: Float[Array, "3"],
-    covariance: Float[Array, "3 3"],
-    *,
-    method: TriangulationMethod = _LINEAR,
-    key: Key[Array, ""] | None = None,
-) -> Gaussian:
-    """Density of the point that a stereo measurement shows.
-
-    The range is inversely proportional to the disparity: its error grows as ``sigma_z = sqrt(2) sigma z^2 / (f B)``,
-    and its density becomes skewed far away, where `Unscented` keeps the mean and the size that `Linear` loses.
+def midpoint(
+    centers: Float[Array, "n 3"], rays: Float[Array, "n 3"], *, valid: Bool[Array, " n"] | None = None
+) -> Float[Array, "3"]:
+    """The point nearest to all rays: ``sum (I - r r^T) (x - c) = 0``.
 
     Args:
-        rig: the stereo rig.
-        measurement: (u_left, u_right, v), px. Without disparity (`rig.has_depth`) the result is finite but worthless.
-        covariance: "3 3" of the measurement, px^2.
-        method: `Linear()`, `Unscented()` or `Sampled()`.
-        key: random key, for `Sampled` only.
+        centers: of the cameras, world frame, m.
+        rays: unit bearings, world frame.
+        valid: which count.
 
     Returns:
-        Density of the point (x, y, z), left camera frame, m.
-
-    Raises:
-        ValueError: if the method needs a key and there is none.
+        The point, world frame, m; of parallel rays one of many, finite.
 
     References:
-        Thesis section 4.3, Fig. 4.6-4.7 [T-72], [T-73]; section 1.3 [T-7].
+        Hartley and Sturm, "Triangulation", CVIU 1997, section 5.3 [T-8].
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
-        >>> rig = jl.sensors.StereoRig(jl.sensors.Pinhole(718.856, 718.856, 607.2, 185.2), 387.57 / 718.856)
-        >>> measurement = rig.project(jnp.array([[1.0, 0.5, 20.0]]))[0]
-        >>> point = jl.multiview.triangulation.stereo(rig, measurement, 0.25 * jnp.eye(3))
-        >>> round(float(jnp.sqrt(point.covariance[2, 2])), 2)
-        0.73
+        >>> centers = jnp.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+        >>> rays = jnp.array([[0.6, 0.0, 0.8], [-0.6, 0.0, 0.8]])
+        >>> [round(float(x), 2) for x in jl.multiview.triangulation.midpoint(centers, rays)]
+        [1.0, 0.0, 1.33]
     """
-    return method.triangulate(rig, Gaussian(measurement, covariance), key)
-
-
-def stereo_jacobian(rig: StereoRig, measurement: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Derivative of the point (x, y, z) by (u_left, u_right, v).
-
-    With ``d = u_left - u_right`` the rows are ``[z / fx - x / d, x / d, -z skew / (fx fy)]``,
-    ``[-y / d, y / d, z / fy]`` and ``[-z / d, z / d, 0]``.
-
-    Args:
-        rig: the stereo rig.
-        measurement: (u_left, u_right, v), px.
-
-    Returns:
-        "3 3", m/px.
-
-    References:
-        Thesis section 4.3, for fx = fy and no skew [T-72].
-
-    Example:
-        >>> import jax.numpy as jnp, jaxloc as jl
-        >>> rig = jl.sensors.StereoRig(jl.sensors.Pinhole(700.0, 700.0, 600.0, 180.0), baseline=0.5)
-        >>> jl.multiview.triangulation.stereo_jacobian(rig, jnp.array([600.0, 565.0, 180.0]))[2].round(2).tolist()
-        [-0.28999999165534973, 0.28999999165534973, 0.0]
-    """
-    camera = rig.camera
-    x, y, z = rig.triangulate(measurement[None])[0]
-    disparity = camera.fx * rig.baseline / z
-    zero = jnp.zeros_like(z)
-    rows = [
-        [z / camera.fx - x / disparity, x / disparity, -z * camera.skew / (camera.fx * camera.fy)],
-        [-y / disparity, y / disparity, z / camera.fy],
-        [-z / disparity, z / disparity, zero],
-    ]
-    return jnp.stack([jnp.stack(row) for row in rows])
+    counts = jnp.ones(rays.shape[:1], bool) if valid is None else valid
+    safe_rays = jnp.where(counts[:, None], rays, 0.0)
+    safe_centers = jnp.where(counts[:, None], centers, 0.0)
+    eye = jnp.eye(3, dtype=rays.dtype)
+    number = jnp.sum(counts).astype(rays.dtype)
+    # About the mean center: the sums then hold the baselines, not the distance from the origin.
+    middle = jnp.sum(safe_centers, axis=0) / jnp.maximum(number, 1.0)
+    offsets = jnp.where(counts[:, None], safe_centers - middle[None, :], 0.0)
+    across = offsets - safe_rays * jnp.sum(safe_rays * offsets, axis=1, keepdims=True)
+    matrix = number * eye - matmul(safe_rays.T, safe_rays)
+    return middle + factor(matrix).solve(jnp.sum(across, axis=0))
 
 
 @eqx.filter_jit
-def coverage(
-    rig: StereoRig,
-    point: Float[Array, "3"],
-    covariance: Float[Array, "3 3"],
-    *,
-    key: Key[Array, ""],
-    method: TriangulationMethod = _LINEAR,
-    probability: float = 0.95,
-    num_trials: int = 1000,
-) -> Float[Array, ""]:
-    """How often the ellipsoid of `stereo` holds the true point: it should be the given probability.
+def correct_pair(
+    first: Float[Array, "2"], second: Float[Array, "2"], matrix: Float[Array, "3 3"]
+) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+    """Moves two corresponding points by the least sum of squares until their rays meet: ``x1^T M x2 = 0``.
+
+    Two fixed steps, the first of which solves a quadratic equation; the rest is of the order of rounding. `midpoint` of
+    the corrected rays is the optimal point of two views.
 
     Args:
-        rig: the stereo rig.
-        point: true point, left camera frame, m.
-        covariance: "3 3" of the measurements, px^2.
-        key: random key.
-        method: as for `stereo`.
-        probability: of the ellipsoid.
-        num_trials: number of simulated measurements.
+        first: in the first picture: px, or coordinates normalized alike in both pictures.
+        second: in the second picture.
+        matrix: fundamental (px) or essential matrix with ``x1^T M x2 = 0``.
 
     Returns:
-        Fraction of trials whose squared Mahalanobis distance lies inside the chi-square gate.
+        The corrected points. On the epipoles, where nothing is constrained, they stay.
 
     References:
-        Thesis Fig. 4.7 [T-73].
+        Lindstrom, "Triangulation made easy", CVPR 2010, algorithm niter2.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> sideways = jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+        >>> moved = jl.multiview.triangulation.correct_pair(jnp.array([2.0, 1.0]), jnp.array([1.0, 3.0]), sideways)
+        >>> [point.round(3).tolist() for point in moved]
+        [[2.0, 2.0], [1.0, 2.0]]
+    """
+    one = jnp.ones((1,), first.dtype)
+    x, y = jnp.concatenate([first, one]), jnp.concatenate([second, one])
+    image, back = matmul(matrix, y), matmul(matrix.T, x)
+    inner, n, m = matrix[:2, :2], image[:2], back[:2]
+    a, b, c = jnp.sum(n * matmul(inner, m)), 0.5 * (jnp.sum(n * n) + jnp.sum(m * m)), jnp.sum(x * image)
+    discriminant = b * b - a * c
+    root = jnp.where(discriminant > 0, jnp.sqrt(jnp.where(discriminant > 0, discriminant, 1.0)), 0.0)
+    step = _ratio(c, b + root)
+    n, m = n - step * matmul(inner, m), m - step * matmul(inner.T, n)
+    step = step * _ratio(2.0 * root, jnp.sum(n * n) + jnp.sum(m * m))
+    return first - step * n, second - step * m
+
+
+def _ratio(top: Float[Array, ""], bottom: Float[Array, ""]) -> Float[Array, ""]:
+    """A quotient of what is not negative below; zero where that is zero."""
+    some = bottom > float(jnp.finfo(bottom.dtype).tiny)
+    return jnp.where(some, top / jnp.where(some, bottom, 1.0), 0.0)
+
+
+class TriangulationProblem(Problem):
+    """Pixels of one point in several cameras; the state is the point, world frame.
+
+    Attributes:
+        camera: of all pictures.
+        poses: ``T_world_camera``, a stack.
+        pixels: "2 n"; finite everywhere.
+        sigma: standard deviation of a pixel coordinate, one a picture, px.
+        valid: which count.
+        loss: robust kernel over the two coordinates.
+    """
+
+    camera: Pinhole
+    poses: SE3
+    pixels: Float[Array, "2 n"]
+    sigma: Float[Array, " n"]
+    valid: Bool[Array, " n"]
+    loss: Any = Quadratic()
+
+    def residual(self, state: Float[Array, "3"]) -> Float[Array, "2 n"]:
+        """Whitened pixel errors; dear where the point lies behind the camera."""
+        c, seen = self._seen(state)
+        error = (jnp.stack(self.camera.project_components(*c)) - self.pixels) / self.sigma[None, :]
+        unseen = jnp.where(self.valid & ~seen, _UNSEEN, 0.0).astype(error.dtype)
+        return jnp.where(seen[None, :], error, unseen[None, :])
+
+    def linearize(self, state: Float[Array, "3"]) -> Linearization:
+        """Residual and Jacobian by one forward pass for each coordinate."""
+        columns = jnp.eye(3, dtype=state.dtype)
+        residual, push = jax.linearize(self.residual, state)
+        return Linearization(residual, jax.vmap(push)(columns))
+
+    def admissible(self, state: Float[Array, "3"]) -> Bool[Array, ""]:
+        """Whether two cameras have the point before them."""
+        return jnp.sum(self._seen(state)[1]) >= 2
+
+    def _seen(self, point: Array) -> tuple[tuple[Array, Array, Array], Bool[Array, " n"]]:
+        offsets = (point[None, :] - self.poses.translation)[:, :, None]
+        moved = jnp.sum(self.poses.rotation.rotation_matrix * offsets, axis=1)
+        x, y, z = moved[:, 0], moved[:, 1], moved[:, 2]
+        seen = self.valid & self.camera.in_front_components(x, y, z)
+        return (jnp.where(seen, x, 0.0), jnp.where(seen, y, 0.0), jnp.where(seen, z, 1.0)), seen
+
+
+@eqx.filter_jit
+def triangulate(
+    camera: Pinhole,
+    poses: SE3,
+    pixels: Float[Array, "n 2"],
+    *,
+    sigma: Any = 1.0,
+    valid: Bool[Array, " n"] | None = None,
+    loss: Loss = Quadratic(),
+) -> Estimate:
+    """The point that a camera saw from several places: the minimum of the reprojection errors.
+
+    Args:
+        camera: of all pictures; for different ones give normalized coordinates, ``Pinhole(1, 1, 0, 0)``, and a sigma
+            for each.
+        poses: ``T_world_camera``, a stack of n.
+        pixels: where the point was seen, px.
+        sigma: standard deviation of a pixel coordinate, px: a number or one a picture.
+        valid: which pictures count; numbers that are not finite never do.
+        loss: robust kernel over the two coordinates of a picture.
+
+    Returns:
+        Estimate of the point, world frame, m. ``ok`` is False with fewer than two pictures, no baseline, or when the
+        point lies behind the cameras. With little parallax the covariance is large, and the density skewed in depth.
+
+    References:
+        Hartley and Zisserman, *Multiple View Geometry*, 2004, section 12.4; a moving camera makes its baseline
+        itself [T-8].
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxloc as jl
-        >>> rig = jl.sensors.StereoRig(jl.sensors.Pinhole(700.0, 700.0, 600.0, 180.0), baseline=0.5)
-        >>> point, noise = jnp.array([1.0, 0.5, 8.0]), 0.25 * jnp.eye(3)
-        >>> held = jl.multiview.coverage(rig, point, noise, key=jax.random.key(0))
-        >>> bool(jnp.abs(held - 0.95) < 0.03)
-        True
+        >>> camera = jl.sensors.Pinhole(500.0, 500.0, 320.0, 240.0)
+        >>> place = lambda x: jl.poses.SE3.from_euler(jnp.stack([x, 0.0 * x, 0.0 * x]), 0.0, 0.0, 0.0)
+        >>> poses = jax.vmap(place)(jnp.array([0.0, 1.0, 2.0]))
+        >>> seen = jnp.array([[420.0, 240.0], [320.0, 240.0], [220.0, 240.0]])
+        >>> found = jl.multiview.triangulation.triangulate(camera, poses, seen, sigma=0.5)
+        >>> bool(found.ok), found.value.round(3).tolist()
+        (True, [1.0, 0.0, 5.0])
     """
-    noise_key, method_key = jax.random.split(key)
-    noise = jax.random.normal(noise_key, (num_trials, 3), point.dtype)
-    measurements = rig.project(point[None]) + matmul(noise, cholesky(covariance).T)
-
-    def distance(measurement, trial_key):
-        return stereo(rig, measurement, covariance, method=method, key=trial_key).mahalanobis_squared(point)
-
-    distances = jax.vmap(distance)(measurements, jax.random.split(method_key, num_trials))
-    held = gate(distances, 3, probability) & rig.has_depth(measurements)
-    return jnp.mean(held.astype(point.dtype))
+    finite = jnp.all(jnp.isfinite(pixels), axis=1)
+    valid = finite if valid is None else finite & valid
+    pixels = jnp.where(valid[:, None], pixels, 0.0)
+    sigmas = jnp.broadcast_to(jnp.asarray(sigma, pixels.dtype), valid.shape)
+    problem = TriangulationProblem(camera, poses, pixels.T, sigmas, valid, loss)
+    return solve(problem, _start(problem), solver=LevenbergMarquardt())
 
 
-class _PointOf(eqx.Module):
-    """Triangulation as a function with its rig as data: no new compilation for another rig."""
-
-    rig: StereoRig
-
-    def __call__(self, measurement: Float[Array, "3"]) -> Float[Array, "3"]:
-        return self.rig.triangulate(measurement[None])[0]
+def _start(problem: TriangulationProblem) -> Float[Array, "3"]:
+    """Where the rays meet; far ahead if they meet behind a camera."""
+    poses, valid = problem.poses, problem.valid
+    bearings = problem.camera.bearing(problem.pixels.T)
+    rays = jnp.sum(poses.rotation.rotation_matrix * bearings[:, None, :], axis=2)
+    meeting = midpoint(poses.translation, rays, valid=valid)
+    count = jnp.maximum(jnp.sum(valid), 1).astype(rays.dtype)
+    middle, ahead = (jnp.sum(jnp.where(valid[:, None], v, 0.0), axis=0) / count for v in (poses.translation, rays))
+    spread = jnp.sqrt(jnp.sum(jnp.where(valid[:, None], (poses.translation - middle[None, :]) ** 2, 0.0)))
+    seen = jnp.sum(problem._seen(meeting)[1]) == jnp.sum(valid)
+    return jnp.where(seen & jnp.all(jnp.isfinite(meeting)), meeting, middle + 30.0 * spread * ahead)

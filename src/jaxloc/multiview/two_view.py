@@ -19,9 +19,9 @@ from jaxloc.multiview.epipolar import (
 from jaxloc.multiview.five_point import decompose, essential_candidates, facing
 from jaxloc.multiview.homography import transfer_error
 from jaxloc.poses import retract
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Loss, Status, Tukey, align_points, solve
-from jaxloc.solvers.linear import factor
+from jaxloc.solvers.cholesky import factor
 from jaxloc.solvers.ransac import sample_indices
 
 # 99 % of the absolute value of a normal variable.

@@ -15,11 +15,8 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from jaxloc.beliefs import Gaussian, compounding
-from jaxloc.images import describe, detect
-from jaxloc.poses import SE3
-from jaxloc.refinement import StereoMatches
-from jaxloc.sensors import StereoRig
-from jaxloc.slam import (
+from jaxloc.features import opencv
+from jaxloc.odometry import (
     CameraMotion,
     MatchingOptions,
     MotionOptions,
@@ -29,6 +26,9 @@ from jaxloc.slam import (
     match_frames,
     match_stereo,
 )
+from jaxloc.poses import SE3
+from jaxloc.refinement import StereoMatches
+from jaxloc.sensors import StereoRig
 
 
 class Config(eqx.Module):
@@ -47,7 +47,7 @@ class Config(eqx.Module):
         seed: of the random samples.
     """
 
-    detector: detect.AbstractDetector = detect.ShiTomasi()
+    detector: opencv.AbstractDetector = opencv.ShiTomasi()
     capacity: int = 1600
     grid: tuple[int, int] = (6, 12)
     matching: MatchingOptions = MatchingOptions()
@@ -244,11 +244,9 @@ def _observe(frame: Any, config: Config, watch: _Stopwatch) -> StereoFeatures:
     """Keypoints and descriptors of both images, matched between them."""
     images = (frame.left, frame.right)
     with watch.stage("detect"):
-        keypoints = tuple(detect.detect(config.detector, image, config.capacity, config.grid) for image in images)
+        keypoints = tuple(opencv.detect(config.detector, image, config.capacity, config.grid) for image in images)
     with watch.stage("describe"):
-        descriptors = tuple(
-            describe.describe(detect.ORB(), image, k) for image, k in zip(images, keypoints, strict=True)
-        )
+        descriptors = tuple(opencv.describe(opencv.ORB(), image, k) for image, k in zip(images, keypoints, strict=True))
     with watch.stage("stereo"):
         gray = [jnp.asarray(np.asarray(image, dtype=np.float32)) for image in images]
         return jax.block_until_ready(match_stereo(*gray, keypoints, descriptors, options=config.matching))

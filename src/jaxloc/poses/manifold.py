@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxloc.poses.direction import Direction
-from jaxloc.poses.group import Group
+from jaxloc.poses.lie_group import Group
 
 
 def _is_manifold(node: Any) -> bool:

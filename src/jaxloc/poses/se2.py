@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxloc.poses import series
-from jaxloc.poses.group import Group, as_floats, matmul
-from jaxloc.poses.rotation import SO2
+from jaxloc.poses.lie_group import Group, as_floats, matmul
+from jaxloc.poses.so2 import SO2
 
 
 class SE2(Group):

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxloc.poses import series
-from jaxloc.poses.group import Group, as_floats, matmul, skew
-from jaxloc.poses.rotation import SO3
+from jaxloc.poses.lie_group import Group, as_floats, matmul, skew
+from jaxloc.poses.so3 import SO3
 
 
 class SE3(Group):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxloc.poses.group import Group
+from jaxloc.poses.lie_group import Group
 from jaxloc.poses.se3 import SE3
 
 

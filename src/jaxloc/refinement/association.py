@@ -23,11 +23,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import SE2, SE3
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement.attributes import Attribute, Blocks, CornerStrength, Curvature, Identity
 from jaxloc.refinement.correspondences import Correspondences, PointPoint, refine
 from jaxloc.solvers import GemanMcClure, assign
-from jaxloc.solvers.linear import factor
+from jaxloc.solvers.cholesky import factor
 
 __all__ = [
     "Association",

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 
 
 class Attribute(eqx.Module):

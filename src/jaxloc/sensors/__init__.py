@@ -1,35 +1,36 @@
-"""What is measured: forward models of cameras and stereo rigs, and their records."""
+"""Sensor models: cameras, laser range finders, landmarks, ranging and odometers, and the maps they refer to."""
 
 from jaxloc.sensors import (
+    beam_model,
     camera,
-    ceiling,
-    distortion,
-    ground,
+    ground_camera,
     increments,
     landmarks,
-    lane,
-    laser,
+    laser_scan,
+    lenses,
+    likelihood_field,
     maps,
     moving_objects,
     odometer,
     ranging,
-    rig,
-    textured_plane,
+    stereo_rig,
 )
+from jaxloc.sensors.beam_model import BeamModel
 from jaxloc.sensors.camera import Pinhole
-from jaxloc.sensors.ceiling import CeilingMosaic, CeilingSensor
-from jaxloc.sensors.distortion import BrownConrady, KannalaBrandt, Lens
-from jaxloc.sensors.ground import GroundCamera
+from jaxloc.sensors.ground_camera import GroundCamera
 from jaxloc.sensors.increments import Increment, IncrementMotion
 from jaxloc.sensors.landmarks import DescribedReading, RangeBearing, RangeBearingSensor
-from jaxloc.sensors.lane import Lane
-from jaxloc.sensors.laser import BeamModel, LaserScan, LikelihoodField
-from jaxloc.sensors.maps import DistanceField, FreeSpace, OccupancyMap
+from jaxloc.sensors.laser_scan import LaserScan
+from jaxloc.sensors.lenses import BrownConrady, KannalaBrandt, Lens
+from jaxloc.sensors.likelihood_field import LikelihoodField
+from jaxloc.sensors.maps.ceiling import CeilingMosaic, CeilingSensor
+from jaxloc.sensors.maps.distance_field import DistanceField
+from jaxloc.sensors.maps.occupancy_map import FreeSpace, OccupancyMap
+from jaxloc.sensors.maps.textured_plane import Predicted, TexturedPlane
 from jaxloc.sensors.moving_objects import MovingObject, MovingObjectSensor
 from jaxloc.sensors.odometer import DifferentialDrive, OdometryMotion
 from jaxloc.sensors.ranging import Range, RangeSensor, RangingMotion, RangingState
-from jaxloc.sensors.rig import StereoRig
-from jaxloc.sensors.textured_plane import Predicted, TexturedPlane
+from jaxloc.sensors.stereo_rig import StereoRig
 
 __all__ = [
     "BeamModel",
@@ -44,7 +45,6 @@ __all__ = [
     "Increment",
     "IncrementMotion",
     "KannalaBrandt",
-    "Lane",
     "LaserScan",
     "Lens",
     "LikelihoodField",
@@ -62,18 +62,17 @@ __all__ = [
     "RangingState",
     "StereoRig",
     "TexturedPlane",
+    "beam_model",
     "camera",
-    "ceiling",
-    "distortion",
-    "ground",
+    "ground_camera",
     "increments",
     "landmarks",
-    "lane",
-    "laser",
+    "laser_scan",
+    "lenses",
+    "likelihood_field",
     "maps",
     "moving_objects",
     "odometer",
     "ranging",
-    "rig",
-    "textured_plane",
+    "stereo_rig",
 ]

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc.poses import SE3
-from jaxloc.poses.group import as_floats, matmul
-from jaxloc.sensors.distortion import Lens
+from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.sensors.lenses import Lens
 
 _NEAREST = 1e-6  # points nearer than this to the plane of the camera have no picture, m
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.beliefs import Sensor
 from jaxloc.poses import SE2, SO2
-from jaxloc.poses.group import as_floats, matmul
+from jaxloc.poses.lie_group import as_floats, matmul
 
 _NEAREST = 1e-3  # m: closer than this no bearing means anything
 

@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 
 from jaxloc.beliefs import Sensor
 from jaxloc.poses import SE3
-from jaxloc.poses.group import as_floats, matmul
-from jaxloc.sensors.rig import StereoRig
+from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.sensors.stereo_rig import StereoRig
 
 _NEAREST = 1.0  # m: nearer states are measured as well as those
 

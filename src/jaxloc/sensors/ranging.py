@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxloc.beliefs import Motion, Sensor
 from jaxloc.poses import SE2
-from jaxloc.poses.group import as_floats
+from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.increments import Increment, IncrementMotion
 from jaxloc.sensors.landmarks import length, pose_of, row
 

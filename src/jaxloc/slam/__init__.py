@@ -1,34 +1,20 @@
-"""Trajectories and maps."""
+"""Simultaneous localization and mapping: EKF-SLAM, FastSLAM, pose graphs and mosaics."""
 
-from jaxloc.slam import ekf_slam, moving_objects, pose_graph, scene_flow, stereo_matching, visual_odometry
+from jaxloc.slam import ekf_slam, fast_slam, mosaic, pose_graph
 from jaxloc.slam.ekf_slam import EkfSlam, SlamInfo, SlamState
-from jaxloc.slam.moving_objects import GroupOptions, MovingObjects, group_points
-from jaxloc.slam.scene_flow import FlowOptions, MovingPoints, find_moving
-from jaxloc.slam.stereo_matching import MatchingOptions, StereoFeatures, match_frames, match_stereo
-from jaxloc.slam.visual_odometry import CameraMotion, MotionOptions, estimate_disparity_offset, estimate_motion
+from jaxloc.slam.fast_slam import Appearance, DescriptorFastSlam, FastSlam, FastSlamInfo, FastSlamState
 
 __all__ = [
-    "CameraMotion",
+    "Appearance",
+    "DescriptorFastSlam",
     "EkfSlam",
-    "FlowOptions",
-    "GroupOptions",
-    "MatchingOptions",
-    "MotionOptions",
-    "MovingObjects",
-    "MovingPoints",
+    "FastSlam",
+    "FastSlamInfo",
+    "FastSlamState",
     "SlamInfo",
     "SlamState",
-    "StereoFeatures",
     "ekf_slam",
-    "estimate_disparity_offset",
-    "estimate_motion",
-    "find_moving",
-    "group_points",
-    "match_frames",
-    "match_stereo",
-    "moving_objects",
+    "fast_slam",
+    "mosaic",
     "pose_graph",
-    "scene_flow",
-    "stereo_matching",
-    "visual_odometry",
 ]

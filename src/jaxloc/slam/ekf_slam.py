@@ -20,11 +20,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc.beliefs import Gaussian, Motion, gate
-from jaxloc.beliefs.conditional import innovation, mask_covariance
-from jaxloc.beliefs.squareroot import cholesky, solve, whiten
+from jaxloc.beliefs.models import innovation, mask_covariance
+from jaxloc.beliefs.square_root import cholesky, solve, whiten
 from jaxloc.filters import Filter, FilterState, Info
 from jaxloc.poses import SE2
-from jaxloc.poses.group import as_floats, matmul
+from jaxloc.poses.lie_group import as_floats, matmul
 from jaxloc.sensors.landmarks import RangeBearing, locate, locate_covariance, observe, polar_jacobian, sanitize
 
 _QUARTER = ((0.0, -1.0), (1.0, 0.0))  # turns a vector counter-clockwise by a right angle

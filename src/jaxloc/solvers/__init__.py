@@ -1,26 +1,26 @@
-"""How a residual is minimized, and how sure the answer is."""
+"""Nonlinear least squares on manifolds, robust kernels, RANSAC, assignment and point alignment."""
 
 from jaxloc.solvers import (
     assignment,
-    closed_form,
+    cholesky,
     estimate,
     gauss_newton,
-    graduated,
+    graduated_nonconvexity,
     least_squares,
-    linear,
+    point_alignment,
     problem,
-    robust,
+    robust_kernels,
 )
 from jaxloc.solvers.assignment import Assignment, assign
-from jaxloc.solvers.closed_form import PointAlignment, Similarity, align_points, align_scaled_points
+from jaxloc.solvers.cholesky import Cholesky
 from jaxloc.solvers.estimate import Estimate, Observability, Status
 from jaxloc.solvers.gauss_newton import Dogleg, GaussNewton, LevenbergMarquardt, Solver
-from jaxloc.solvers.graduated import solve_graduated
+from jaxloc.solvers.graduated_nonconvexity import solve_graduated
 from jaxloc.solvers.least_squares import solve
-from jaxloc.solvers.linear import Cholesky
+from jaxloc.solvers.point_alignment import PointAlignment, Similarity, align_points, align_scaled_points
 from jaxloc.solvers.problem import FunctionProblem, Linearization, Problem
 from jaxloc.solvers.ransac import Candidates, Consensus, ransac, required_hypotheses
-from jaxloc.solvers.robust import Barron, Cauchy, GemanMcClure, Huber, Loss, Quadratic, Tukey
+from jaxloc.solvers.robust_kernels import Barron, Cauchy, GemanMcClure, Huber, Loss, Quadratic, Tukey
 
 __all__ = [
     "Assignment",
@@ -50,16 +50,16 @@ __all__ = [
     "align_scaled_points",
     "assign",
     "assignment",
-    "closed_form",
+    "cholesky",
     "estimate",
     "gauss_newton",
-    "graduated",
+    "graduated_nonconvexity",
     "least_squares",
-    "linear",
+    "point_alignment",
     "problem",
     "ransac",
     "required_hypotheses",
-    "robust",
+    "robust_kernels",
     "solve",
     "solve_graduated",
 ]

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import tangent_labels
-from jaxloc.solvers.linear import rank_tolerance
+from jaxloc.solvers.cholesky import rank_tolerance
 
 
 class Status(IntEnum):

@@ -19,8 +19,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.poses import retract
+from jaxloc.solvers.cholesky import Cholesky, factor
 from jaxloc.solvers.estimate import Status
-from jaxloc.solvers.linear import Cholesky, factor
 from jaxloc.solvers.problem import Problem, items, normal_equations, with_losses
 
 

@@ -10,10 +10,10 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from jaxloc.poses import retract, tangent_dimension
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
+from jaxloc.solvers.cholesky import factor
 from jaxloc.solvers.estimate import Estimate, Status
 from jaxloc.solvers.gauss_newton import GaussNewton, Solver, TangentSolver
-from jaxloc.solvers.linear import factor
 from jaxloc.solvers.problem import (
     NormalEquations,
     Problem,

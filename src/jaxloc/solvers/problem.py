@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc.poses import retract, tangent_dimension
-from jaxloc.poses.group import matmul
-from jaxloc.solvers.linear import factor
-from jaxloc.solvers.robust import Loss, Quadratic
+from jaxloc.poses.lie_group import matmul
+from jaxloc.solvers.cholesky import factor
+from jaxloc.solvers.robust_kernels import Loss, Quadratic
 
 
 class Linearization(NamedTuple):

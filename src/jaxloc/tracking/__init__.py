@@ -1,15 +1,15 @@
-"""Many targets at once: who is there, where, and since when."""
+"""Multi-target tracking: GM-PHD, CPHD, GNN, PDA, JPDA and MHT filters, and the models they share."""
 
-from jaxloc.tracking import birth, clutter, contract, cphd, gating, gmphd, gnn, jpda, mht, model, pda, scan, tracks
-from jaxloc.tracking.birth import Birth, MeasuredBirth, PointBirth, StaticBirth
-from jaxloc.tracking.clutter import Clutter, FrustumClutter, UniformClutter
-from jaxloc.tracking.contract import Targets, Tracker, TrackerInfo
+from jaxloc.tracking import cphd, gating, gmphd, gnn, interface, jpda, likelihood_ratio, mht, models, pda, tracks
 from jaxloc.tracking.cphd import CphdState, GmCphd
 from jaxloc.tracking.gmphd import GmPhd, PhdState, Spawning
 from jaxloc.tracking.gnn import GlobalNearestNeighbor
+from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
 from jaxloc.tracking.jpda import BeliefPropagation, Exact, JointProbabilisticDataAssociation, Marginals
 from jaxloc.tracking.mht import Hypotheses, MultipleHypothesisTracker
-from jaxloc.tracking.model import ConstantDetection, Detection, FieldOfView, TargetModel
+from jaxloc.tracking.models.birth import Birth, MeasuredBirth, PointBirth, StaticBirth
+from jaxloc.tracking.models.clutter import Clutter, FrustumClutter, UniformClutter
+from jaxloc.tracking.models.target import ConstantDetection, Detection, FieldOfView, TargetModel
 from jaxloc.tracking.pda import Association, ProbabilisticDataAssociation
 from jaxloc.tracking.tracks import CountLife, ExistenceLife, Life, Tracks
 
@@ -46,17 +46,15 @@ __all__ = [
     "TrackerInfo",
     "Tracks",
     "UniformClutter",
-    "birth",
-    "clutter",
-    "contract",
     "cphd",
     "gating",
     "gmphd",
     "gnn",
+    "interface",
     "jpda",
+    "likelihood_ratio",
     "mht",
-    "model",
+    "models",
     "pda",
-    "scan",
     "tracks",
 ]

@@ -19,10 +19,10 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxloc.beliefs import Mixture
 from jaxloc.filters import FilterState
 from jaxloc.filters.kalman import finite_or_zero
-from jaxloc.tracking.birth import MeasuredBirth
-from jaxloc.tracking.contract import Targets, Tracker, TrackerInfo
 from jaxloc.tracking.gating import compare, count_valid, with_room
 from jaxloc.tracking.gmphd import Evidence, GmPhd, choose, predict, reduce_counted, safe_log, tell_apart
+from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
+from jaxloc.tracking.models.birth import MeasuredBirth
 
 _NEVER = -1e15  # a logarithm of zero whose multiples stay finite
 

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.beliefs import chi2_quantile
-from jaxloc.beliefs.conditional import innovation
-from jaxloc.beliefs.squareroot import product, whiten
+from jaxloc.beliefs.models import innovation
+from jaxloc.beliefs.square_root import product, whiten
 from jaxloc.filters import GaussianState
 from jaxloc.filters.kalman import GaussianFilter, finite_or_zero, recenter, regular
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 
 
 class Comparison(eqx.Module):

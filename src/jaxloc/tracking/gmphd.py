@@ -17,11 +17,11 @@ from jaxloc.beliefs import Closeness, MahalanobisDistance, Mixture, Motion, redu
 from jaxloc.filters import FilterState, GaussianState, History
 from jaxloc.filters import run as run_filter
 from jaxloc.filters.kalman import finite_or_zero, spread_motion
-from jaxloc.poses.group import as_floats, matmul
-from jaxloc.tracking.birth import MeasuredBirth
-from jaxloc.tracking.contract import Targets, Tracker, TrackerInfo
+from jaxloc.poses.lie_group import as_floats, matmul
 from jaxloc.tracking.gating import Comparison, compare, corrected, count_valid, with_room
-from jaxloc.tracking.model import TargetModel
+from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
+from jaxloc.tracking.models.birth import MeasuredBirth
+from jaxloc.tracking.models.target import TargetModel
 
 
 class Spawning(eqx.Module):

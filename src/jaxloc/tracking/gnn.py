@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float, Key
 from jaxloc.beliefs import Mixture
 from jaxloc.filters.kalman import select
 from jaxloc.solvers.assignment import assign
-from jaxloc.tracking.contract import Targets, Tracker, TrackerInfo
-from jaxloc.tracking.model import TargetModel
-from jaxloc.tracking.scan import correct_tracks, examine, whole
+from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
+from jaxloc.tracking.likelihood_ratio import correct_tracks, examine, whole
+from jaxloc.tracking.models.target import TargetModel
 from jaxloc.tracking.tracks import (
     ExistenceLife,
     Life,

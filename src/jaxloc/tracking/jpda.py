@@ -10,11 +10,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc.beliefs import Mixture
-from jaxloc.poses.group import matmul
-from jaxloc.tracking.contract import Targets, Tracker, TrackerInfo
-from jaxloc.tracking.model import TargetModel
+from jaxloc.poses.lie_group import matmul
+from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
+from jaxloc.tracking.likelihood_ratio import examine
+from jaxloc.tracking.models.target import TargetModel
 from jaxloc.tracking.pda import Association, absorb, require_gaussian, scaled_weights
-from jaxloc.tracking.scan import examine
 from jaxloc.tracking.tracks import ExistenceLife, Life, Tracks, extract_tracks, open_tracks, predict_tracks
 
 _LARGEST_EXACT = 14  # bits of a set: 16384 sums a step

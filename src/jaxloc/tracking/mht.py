@@ -17,10 +17,10 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxloc.beliefs import Mixture
 from jaxloc.filters import FilterState
 from jaxloc.filters.kalman import select
-from jaxloc.poses.group import matmul
-from jaxloc.tracking.contract import Targets, Tracker, TrackerInfo
-from jaxloc.tracking.model import TargetModel
-from jaxloc.tracking.scan import Scan, correct_tracks, examine, whole
+from jaxloc.poses.lie_group import matmul
+from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
+from jaxloc.tracking.likelihood_ratio import Scan, correct_tracks, examine, whole
+from jaxloc.tracking.models.target import TargetModel
 from jaxloc.tracking.tracks import NO_LABEL, ExistenceLife, Tracks, age_tracks, miss, open_tracks, predict_tracks
 
 _NEVER = -1e30  # log weight of what cannot be

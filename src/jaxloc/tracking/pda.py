@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc.beliefs import Mixture
-from jaxloc.beliefs.squareroot import cholesky, product, triangularize
+from jaxloc.beliefs.square_root import cholesky, product, triangularize
 from jaxloc.filters import GaussianFilter, GaussianState
 from jaxloc.filters.kalman import recenter, select
-from jaxloc.tracking.contract import Targets, Tracker, TrackerInfo
 from jaxloc.tracking.gating import Comparison
-from jaxloc.tracking.model import TargetModel
-from jaxloc.tracking.scan import Scan, examine, whole
+from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
+from jaxloc.tracking.likelihood_ratio import Scan, examine, whole
+from jaxloc.tracking.models.target import TargetModel
 from jaxloc.tracking.tracks import (
     ExistenceLife,
     Life,

@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.beliefs import Gaussian, Mixture
 from jaxloc.filters import FilterState
-from jaxloc.poses.group import as_floats
-from jaxloc.tracking.birth import StaticBirth
-from jaxloc.tracking.contract import Targets
-from jaxloc.tracking.model import TargetModel
+from jaxloc.poses.lie_group import as_floats
+from jaxloc.tracking.interface import Targets
+from jaxloc.tracking.models.birth import StaticBirth
+from jaxloc.tracking.models.target import TargetModel
 
 _REMEMBERED = 31  # scans, in the bits of an integer
 NO_LABEL = -1

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxloc.data.sequence import DataError
+from jaxloc.data.io.errors import DataError
 from jaxloc.data.tracking import kitti_tracking
 from jaxloc.data.tracking.kitti_tracking import (
     read_calibration,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxloc.data.sequence import DataError
+from jaxloc.data.io.errors import DataError
 from jaxloc.data.tracking import read_mot_detections, read_mot_tracks, write_mot
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Num
 
-from jaxloc.images.normalize import as_grey
+from jaxloc.images.normalization import as_grey
 
 
 class Response(eqx.Module):

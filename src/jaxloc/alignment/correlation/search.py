@@ -22,7 +22,7 @@ from jaxloc.alignment.correlation.scores import (
     unknown_places,
 )
 from jaxloc.alignment.correlation.shift import STEPS, refine_shift
-from jaxloc.images.normalize import as_grey
+from jaxloc.images.normalization import as_grey
 from jaxloc.images.warps import Translation
 from jaxloc.solvers import Estimate, Status
 

@@ -12,7 +12,7 @@ from jaxloc.alignment.correlation.scores import NormalizedCorrelation, Pair, Sco
 from jaxloc.images.gradients import central_difference
 from jaxloc.images.interpolation import Bicubic
 from jaxloc.images.patches import extract
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 
 _LEAST_SIGMA = 0.01  # what interpolation errs by without noise, px
 STEPS = 4

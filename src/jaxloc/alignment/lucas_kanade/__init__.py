@@ -2,14 +2,6 @@
 
 from jaxloc.alignment.lucas_kanade.align import align
 from jaxloc.alignment.lucas_kanade.brightness import Bias, Brightness, Correlation, GainBias, Unchanged
-from jaxloc.alignment.lucas_kanade.descents import (
-    Descent,
-    DiagonalStep,
-    GaussNewtonStep,
-    LevenbergMarquardtStep,
-    NewtonStep,
-    SteepestDescentStep,
-)
 from jaxloc.alignment.lucas_kanade.formulations import (
     Formulation,
     ForwardsAdditive,
@@ -17,8 +9,16 @@ from jaxloc.alignment.lucas_kanade.formulations import (
     InverseAdditive,
     InverseCompositional,
 )
+from jaxloc.alignment.lucas_kanade.options import LucasKanade
 from jaxloc.alignment.lucas_kanade.scales import Blurred, FullSize, Pyramid, Scales
-from jaxloc.alignment.lucas_kanade.settings import LucasKanade
+from jaxloc.alignment.lucas_kanade.steps import (
+    Descent,
+    DiagonalStep,
+    GaussNewtonStep,
+    LevenbergMarquardtStep,
+    NewtonStep,
+    SteepestDescentStep,
+)
 
 __all__ = [
     "Bias",

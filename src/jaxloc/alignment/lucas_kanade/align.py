@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
-from jaxloc.alignment.lucas_kanade.conclusion import Evidence, conclude, follow_root
-from jaxloc.alignment.lucas_kanade.descend import Descended, Limits, descend
-from jaxloc.alignment.lucas_kanade.equations import zero_brightness
-from jaxloc.alignment.lucas_kanade.level import Frame, Level
-from jaxloc.alignment.lucas_kanade.settings import LucasKanade
-from jaxloc.images.normalize import as_grey
+from jaxloc.alignment.lucas_kanade.covariance import Evidence, conclude, follow_root
+from jaxloc.alignment.lucas_kanade.iteration import Descended, Limits, descend
+from jaxloc.alignment.lucas_kanade.normal_equations import zero_brightness
+from jaxloc.alignment.lucas_kanade.options import LucasKanade
+from jaxloc.alignment.lucas_kanade.pyramid_level import Frame, Level
+from jaxloc.images.normalization import as_grey
 from jaxloc.images.warps import Warp
 from jaxloc.solvers import Estimate
 

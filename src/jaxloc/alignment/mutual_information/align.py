@@ -9,13 +9,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxloc.alignment.lucas_kanade.level import Frame
+from jaxloc.alignment.lucas_kanade.pyramid_level import Frame
 from jaxloc.alignment.mutual_information.density import Binning, joint_density, log_ratio, pixel_weights
 from jaxloc.images.gradients import smooth
 from jaxloc.images.interpolation import Bicubic, sample
-from jaxloc.images.normalize import as_grey
+from jaxloc.images.normalization import as_grey
 from jaxloc.images.warps import Warp
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers import Estimate, Status
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.text import parse_numbers, read_text
 from jaxloc.data.landmarks.log import LandmarkLog, assemble, ranges_and_bearings
-from jaxloc.data.sequence import DataError
-from jaxloc.data.tables import parse_numbers, read_text
 from jaxloc.poses.planar import compose_poses
 
 _NUMBERS = {"ODOMETRY": 11, "LANDMARK": 7}

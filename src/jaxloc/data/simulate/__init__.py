@@ -1,33 +1,5 @@
 """Synthetic worlds that give the library's own records, with exact truth."""
 
-from jaxloc.data.simulate import (
-    camera,
-    ceiling,
-    floor,
-    landmarks,
-    laser,
-    points,
-    rendering,
-    road,
-    road_drive,
-    road_geometry,
-    targets,
-    textures,
-    world,
-)
+from jaxloc.data.simulate import ceiling, floor, landmarks, laser, pallet, road, stereo_points, street, targets
 
-__all__ = [
-    "camera",
-    "ceiling",
-    "floor",
-    "landmarks",
-    "laser",
-    "points",
-    "rendering",
-    "road",
-    "road_drive",
-    "road_geometry",
-    "targets",
-    "textures",
-    "world",
-]
+__all__ = ["ceiling", "floor", "landmarks", "laser", "pallet", "road", "stereo_points", "street", "targets"]

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Float32, Float64, UInt8
 from jaxloc.images.interpolation import Bicubic, sample_components
 from jaxloc.poses.planar import compose_poses, relative_poses
 from jaxloc.sensors import BrownConrady, Pinhole
-from jaxloc.sensors.ground import GroundCamera
+from jaxloc.sensors.ground_camera import GroundCamera
 
 _OCTAVES = ((2, 0.55), (4, 0.7), (8, 0.8), (16, 0.8), (64, 0.9))  # texels from blob to blob, amplitude
 _BLUR = 1.0  # of the finished texture, texels: leaves 1 % of the contrast at the highest frequency

@@ -21,9 +21,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float64
 
-from jaxloc.data.sequence import DataError
-from jaxloc.data.tables import check_rotations, parse_numbers, read_rows, read_text
-from jaxloc.data.tracking.detections import Detections, LabelledTracks, Rows, assemble, assemble_tracks, check_frame
+from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.text import check_rotations, parse_numbers, read_rows, read_text
+from jaxloc.data.tracking.records import Detections, LabelledTracks, Rows, assemble, assemble_tracks, check_frame
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person", "Cyclist", "Tram", "Misc")
 _ALIASES = {"Person_sitting": "Person"}

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from jaxloc.data.sequence import DataError
-from jaxloc.data.tables import read_text
-from jaxloc.data.tracking.detections import Detections, LabelledTracks, Rows, assemble, assemble_tracks, check_frame
-from jaxloc.data.writing import write_file
+from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.text import read_text
+from jaxloc.data.io.writing import write_file
+from jaxloc.data.tracking.records import Detections, LabelledTracks, Rows, assemble, assemble_tracks, check_frame
 
 _FEWEST, _MOST = 7, 10
 
@@ -80,8 +80,8 @@ def write_mot(path: Path | str, tracks: LabelledTracks) -> None:
     Example:
         >>> import jaxloc as jl, numpy as np, tempfile, pathlib
         >>> one = np.array([1])
-        >>> rows = jl.data.tracking.detections.Rows(one, one, np.array([[1.0, 2.0, 4.0, 8.0]]), np.ones(1), 7 * one)
-        >>> tracks = jl.data.tracking.detections.assemble_tracks("a", rows, rate=25.0, first=1)
+        >>> rows = jl.data.tracking.records.Rows(one, one, np.array([[1.0, 2.0, 4.0, 8.0]]), np.ones(1), 7 * one)
+        >>> tracks = jl.data.tracking.records.assemble_tracks("a", rows, rate=25.0, first=1)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = pathlib.Path(folder) / "a.txt"
         ...     jl.data.tracking.write_mot(path, tracks)

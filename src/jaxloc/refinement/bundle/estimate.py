@@ -9,12 +9,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import SE3
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement.bundle.problem import Bundle, BundleProblem
 from jaxloc.refinement.bundle.schur import Eliminated, Tangent, eliminate, normal_equations, score_products
 from jaxloc.refinement.bundle.structure import Structure
 from jaxloc.solvers import Estimate, Quadratic, Status
-from jaxloc.solvers.linear import factor
+from jaxloc.solvers.cholesky import factor
 
 
 class BundleEstimate(eqx.Module):

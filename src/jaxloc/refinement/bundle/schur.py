@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement.bundle.problem import Bundle, BundleProblem, Sights, pose_rows
 from jaxloc.refinement.bundle.structure import Structure, with_zero
-from jaxloc.solvers.linear import Factor, factor, rank_tolerance
+from jaxloc.solvers.cholesky import Factor, factor, rank_tolerance
 
 
 class Tangent(eqx.Module):

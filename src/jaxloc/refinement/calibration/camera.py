@@ -9,10 +9,10 @@ from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
 from jaxloc.poses import SE3
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement.calibration.model import Intrinsics, Parametrization
 from jaxloc.refinement.calibration.problem import BoardProblem, CameraProblem, Unknowns
-from jaxloc.refinement.calibration.start import Views, closed_form, extent, safe_views
+from jaxloc.refinement.calibration.zhang import Views, closed_form, extent, safe_views
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Quadratic, Solver, solve
 from jaxloc.solvers.estimate import Status

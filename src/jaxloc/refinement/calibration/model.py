@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors import BrownConrady, KannalaBrandt, Pinhole
-from jaxloc.sensors.distortion import Lens
+from jaxloc.sensors.lenses import Lens
 
 _PINHOLE = ("fx", "fy", "cx", "cy", "skew")
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc.poses import SE3, SO3
-from jaxloc.poses.group import matmul
+from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement.calibration.camera import carried, check_corners, fit, prepare
 from jaxloc.refinement.calibration.model import Intrinsics
 from jaxloc.refinement.calibration.problem import CameraProblem, Rig, StereoProblem, Unknowns
-from jaxloc.refinement.calibration.start import safe_views
+from jaxloc.refinement.calibration.zhang import safe_views
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Quadratic, solve
 

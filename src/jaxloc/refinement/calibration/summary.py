@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration.problem import project
-from jaxloc.refinement.calibration.start import safe_views
+from jaxloc.refinement.calibration.zhang import safe_views
 from jaxloc.sensors import KannalaBrandt, Pinhole
 from jaxloc.solvers import Estimate
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.images.gradients import central_difference, smooth
 from jaxloc.images.interpolation import sample
-from jaxloc.images.normalize import as_grey
+from jaxloc.images.normalization import as_grey
 from jaxloc.refinement.pallet.model import PalletType
 from jaxloc.sensors import GroundCamera
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxloc.images.interpolation import sample
-from jaxloc.images.normalize import standardize
+from jaxloc.images.normalization import standardize
 from jaxloc.poses import SE2
 from jaxloc.refinement.pallet.edges import LevelView
 from jaxloc.refinement.pallet.model import PalletType

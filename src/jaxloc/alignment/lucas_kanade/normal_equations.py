@@ -1,0 +1,251 @@
+"""The normal equations of one comparison of two pictures, brightness eliminated and outliers weighted down."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxloc.alignment.lucas_kanade.formulations import Formulation, Linearized
+from jaxloc.alignment.lucas_kanade.pyramid_level import Level
+from jaxloc.images.interpolation import AbstractInterpolation
+from jaxloc.images.warps import Warp
+from jaxloc.poses.lie_group import matmul
+from jaxloc.solvers.cholesky import factor
+from jaxloc.solvers.robust_kernels import Loss, Quadratic
+
+_SCALE_SAMPLES = 1024  # pixels that tell the residual's scale: sorting all of them would cost more than the step
+
+
+class Matching(eqx.Module):
+    """How pictures are compared: what `equations` needs beside them.
+
+    Attributes:
+        formulation: which picture is differentiated.
+        interpolation: of the image.
+        loss: kernel on residuals over their scale.
+        sigma: scale of residuals, grey levels; None measures it by the median of their sizes.
+    """
+
+    formulation: Formulation
+    interpolation: AbstractInterpolation
+    loss: Loss
+    sigma: Float[Array, ""] | None
+
+
+class Equations(eqx.Module):
+    """What is known at a warp, in normalized coordinates.
+
+    Attributes:
+        hessian: of half the weighted squared residual.
+        gradient: its derivative.
+        brightness: coefficients of the brightness columns.
+        gain: contrast of the image over that of the template.
+        mean_cost: half the weighted mean squared residual, grey levels squared; infinite where nothing is seen.
+    """
+
+    hessian: Float[Array, "d d"]
+    gradient: Float[Array, " d"]
+    brightness: Float[Array, " k"]
+    gain: Float[Array, ""]
+    mean_cost: Float[Array, ""]
+
+
+class Weighted(eqx.Module):
+    """Residuals of a comparison with their weights.
+
+    Attributes:
+        difference: image less template, where both are.
+        residual: what brightness leaves of it.
+        weight: of each pixel.
+    """
+
+    difference: Float[Array, " n"]
+    residual: Float[Array, " n"]
+    weight: Float[Array, " n"]
+
+
+def weigh(level: Level, linear: Linearized, brightness: Float[Array, " k"], matching: Matching) -> Weighted:
+    """Differences, residuals under given brightness, and their weights."""
+    weight = jnp.where(linear.known, level.weight, 0.0)
+    difference = jnp.where(weight > 0, linear.values - level.template, 0.0)
+    residual = difference - matmul(brightness, level.columns)
+    if isinstance(matching.loss, Quadratic):
+        return Weighted(difference, residual, weight)
+    scale = _scale(residual, weight) if matching.sigma is None else matching.sigma
+    return Weighted(difference, residual, weight * matching.loss.weight((residual / scale) ** 2))
+
+
+def weight_slope(level: Level, weighted: Weighted, matching: Matching) -> Float[Array, " n"]:
+    """Derivative of each weight by its residual, the scale held."""
+    if isinstance(matching.loss, Quadratic):
+        return jnp.zeros_like(weighted.residual)
+    scale = _scale(weighted.residual, weighted.weight) if matching.sigma is None else matching.sigma
+    squared = (weighted.residual / scale) ** 2
+    fall = jax.jvp(matching.loss.weight, (squared,), (jnp.ones_like(squared),))[1]
+    known = weighted.weight > 0
+    return jnp.where(known, level.weight * fall * 2.0 * weighted.residual / scale**2, 0.0)
+
+
+class Prepared(eqx.Module):
+    """What an inverse formulation computes once.
+
+    Attributes:
+        steepest: steepest descent images of the template.
+        hessian: of the whole template, brightness eliminated; None where robust weights change it in every step.
+    """
+
+    steepest: Float[Array, "d n"]
+    hessian: Float[Array, "d d"] | None
+
+    @staticmethod
+    def of(level: Level, warp: Warp, matching: Matching) -> "Prepared | None":
+        """Nothing for forward formulations."""
+        if not matching.formulation.inverse:
+            return None
+        right, down = warp.jacobian_components(level.u, level.v)
+        steepest = level.slope[0][None] * right + level.slope[1][None] * down
+        if not isinstance(matching.loss, Quadratic):
+            return Prepared(steepest, None)
+        sums = Sums.of(steepest, level, jnp.zeros_like(level.template), level.weight)
+        return Prepared(steepest, sums.hessian(steepest, level.weight))
+
+
+class Sums(eqx.Module):
+    """Weighted products of steepest images, brightness columns and the difference, brightness eliminated from them.
+
+    Attributes:
+        by_columns: steepest images with columns.
+        coefficients: of brightness in the difference.
+        gradient: steepest images with what brightness leaves of the difference.
+        squares: of what it leaves.
+        leaks: coefficients of brightness in the steepest images.
+    """
+
+    by_columns: Float[Array, "d k"]
+    coefficients: Float[Array, " k"]
+    gradient: Float[Array, " d"]
+    squares: Float[Array, ""]
+    leaks: Float[Array, "k d"]
+
+    @staticmethod
+    def of(
+        steepest: Float[Array, "d n"], level: Level, difference: Float[Array, " n"], weight: Float[Array, " n"]
+    ) -> "Sums":
+        """By one product with the steepest images and one among the others."""
+        columns = level.columns
+        k = columns.shape[0]
+        others = jnp.concatenate([columns, difference[None]])
+        weighted = (others * weight[None]).T
+        outer, inner = matmul(steepest, weighted), matmul(others, weighted)
+        if k == 0:
+            return Sums(outer[:, :0], inner[0, :0], outer[:, 0], inner[0, 0], outer[:, :0].T)
+        if level.correlating:
+            return _correlating(outer, inner, level.spread)
+        solver = factor(inner[:k, :k])
+        coefficients = solver.solve(inner[:k, k])
+        leaks = jnp.stack([solver.solve(row) for row in outer[:, :k]], axis=1)
+        gradient = outer[:, k] - matmul(outer[:, :k], coefficients)
+        return Sums(outer[:, :k], coefficients, gradient, inner[k, k] - jnp.sum(inner[:k, k] * coefficients), leaks)
+
+    def hessian(self, steepest: Float[Array, "d n"], weight: Float[Array, " n"]) -> Float[Array, "d d"]:
+        """Products of the steepest images less what brightness explains of them."""
+        return matmul(steepest * weight[None], steepest.T) - matmul(self.by_columns, self.leaks)
+
+
+def _correlating(outer: Float[Array, "d 3"], inner: Float[Array, "3 3"], spread: Float[Array, ""]) -> Sums:
+    """Sums for the greatest correlation: the template counts times ``|i|^2 / t i``, not ``t i / |t|^2``."""
+    total = jnp.where(inner[1, 1] > 0, inner[1, 1], 1.0)
+    mean = inner[1] / total
+    about = inner - inner[:, 1][:, None] * mean[None, :]
+    # The image is the difference plus the template.
+    own = about[2, 2] + 2.0 * spread * about[0, 2] + spread**2 * about[0, 0]
+    both = about[0, 2] + spread * about[0, 0]
+    alike = both > 1e-6 * own
+    contrast = jnp.where(alike, own / jnp.where(alike, both, 1.0), spread)
+    by_template = contrast - spread
+    coefficients = jnp.stack([by_template, mean[2] - by_template * mean[0]])
+    gradient = outer[:, 2] - matmul(outer[:, :2], coefficients)
+    leaks = jnp.stack([jnp.zeros_like(outer[:, 1]), outer[:, 1] / total])
+    energy = own * about[0, 0]
+    unlike = 1.0 - jnp.where(alike, both * both / jnp.where(alike, energy, 1.0), 0.0)
+    return Sums(outer[:, :2], coefficients, gradient, unlike * total * spread**2, leaks)
+
+
+def equations(
+    level: Level,
+    prepared: Prepared | None,
+    warp: Warp,
+    brightness: Float[Array, " k"],
+    matching: Matching,
+    *,
+    second: float = 0.0,
+) -> Equations:
+    """The normal equations at a warp.
+
+    Args:
+        level: both pictures at one scale.
+        prepared: what does not change with the warp.
+        warp: in normalized coordinates.
+        brightness: coefficients by which outliers are told.
+        matching: how pictures are compared.
+        second: how much of the second derivatives' part enters the Hessian.
+
+    Returns:
+        Equations in which brightness is eliminated. The Hessian of an inverse formulation without robust weights is
+        that of the whole template, times the part of it that is seen.
+    """
+    linear = matching.formulation.linearize(level, warp, matching.interpolation)
+    weighted = weigh(level, linear, brightness, matching)
+    steepest = linear.steepest if prepared is None else prepared.steepest
+    sums = Sums.of(steepest, level, weighted.difference, weighted.weight)
+    gain = gain_of(level, sums.coefficients)
+    total, full = jnp.sum(weighted.weight), jnp.sum(level.weight)
+    if prepared is None or prepared.hessian is None:
+        hessian = sums.hessian(steepest, weighted.weight)
+    else:
+        hessian = prepared.hessian * (total / jnp.where(full > 0, full, 1.0))
+    if second:
+        residual = weighted.difference - matmul(sums.coefficients, level.columns)
+        sign = -1.0 / jnp.maximum(gain, 0.25) if matching.formulation.inverse else jnp.ones_like(gain)
+        hessian = hessian + second * sign * _second_order(level, warp, linear, residual * weighted.weight, matching)
+    seen = total > 0
+    mean_cost = jnp.where(seen, 0.5 * sums.squares / jnp.where(seen, total, 1.0), jnp.inf)
+    return Equations(hessian, sums.gradient, sums.coefficients, gain, mean_cost)
+
+
+def gain_of(level: Level, coefficients: Float[Array, " k"]) -> Float[Array, ""]:
+    """Contrast of the image over that of the template: one where brightness has no gain."""
+    one = jnp.ones((), level.template.dtype)
+    if coefficients.shape[0] < 2:
+        return one
+    textured = level.spread > 0
+    return one + jnp.where(textured, coefficients[0] / jnp.where(textured, level.spread, 1.0), 0.0)
+
+
+def _second_order(
+    level: Level, warp: Warp, linear: Linearized, residual: Float[Array, " n"], matching: Matching
+) -> Float[Array, "d d"]:
+    """Sum of residuals times second derivatives of the differentiated picture along the warp."""
+    uu, uv, vv = matching.formulation.second(level, warp, matching.interpolation)
+    along = uu[None] * linear.right + uv[None] * linear.down
+    across = uv[None] * linear.right + vv[None] * linear.down
+    picture = matmul(linear.right * residual[None], along.T) + matmul(linear.down * residual[None], across.T)
+    bend = matching.formulation.bend(level, warp, linear)
+    return picture + jnp.sum(bend * residual[None, None], axis=-1)
+
+
+def _scale(residual: Float[Array, " n"], weight: Float[Array, " n"]) -> Float[Array, ""]:
+    """Standard deviation by the median size of a sample of the residuals."""
+    step = max(1, residual.shape[0] // _SCALE_SAMPLES)
+    sizes, counts = lax.stop_gradient(jnp.abs(residual[::step])), weight[::step] > 0
+    ordered = jnp.sort(jnp.where(counts, sizes, jnp.inf))
+    middle = ordered[jnp.sum(counts) // 2]
+    return jnp.maximum(1.4826 * jnp.where(jnp.isfinite(middle), middle, 1.0), 1e-3)
+
+
+def zero_brightness(level: Level) -> Any:
+    """Coefficients of unchanged brightness."""
+    return jnp.zeros(level.columns.shape[0], level.template.dtype)

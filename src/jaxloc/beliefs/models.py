@@ -1,0 +1,172 @@
+"""What filters assume: how a state moves on, and what a sensor reads there, as densities with tangent noise."""
+
+import math
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Key
+
+from jaxloc.beliefs.square_root import cholesky, whiten
+from jaxloc.poses import local, retract, tangent_dimension
+from jaxloc.poses.lie_group import matmul
+
+
+class Motion(eqx.Module):
+    """The transition density ``p(x' | x, u)``: ``x' = retract(move(x, u), w)``, ``w ~ N(0, covariance(x, u))``.
+
+    States are vectors, poses, or any pytree of them; a control holds whatever one step needs, such as its ``dt``.
+    Parameters that may be learned are array fields.
+    """
+
+    @abstractmethod
+    def move(self, state: Any, control: Any) -> Any:
+        """The state after one step without noise."""
+
+    @abstractmethod
+    def covariance(self, state: Any, control: Any) -> Float[Array, "d d"]:
+        """Covariance of the noise in the tangent space of the moved state."""
+
+    def linearize(self, state: Any, control: Any) -> tuple[Any, Float[Array, "d d"]]:
+        """The moved state and the Jacobian between the tangent spaces of both; override where it is short."""
+        return _linearize(lambda x: self.move(x, control), state)
+
+    def noise_dimension(self, state: Any) -> int:
+        """How many standard normal numbers `perturb` takes: those of the tangent, unless it is overridden."""
+        return tangent_dimension(state)
+
+    def perturb(self, state: Any, control: Any, normal: Float[Array, " k"]) -> Any:
+        """The next state that standard normal numbers lead to: ``retract(move(x, u), L n)``, ``L L^T = covariance``.
+
+        Particle filters draw the numbers of all particles at once and map this over them. Override it (and
+        `noise_dimension`) where noise has a simpler form, or is not a normal in the tangent space.
+        """
+        root = cholesky(self.covariance(state, control))
+        return retract(self.move(state, control), matmul(root, normal))
+
+    def sample(self, state: Any, control: Any, *, key: Key[Array, ""]) -> Any:
+        """One random next state: `perturb` by fresh numbers."""
+        normal = jax.random.normal(key, (self.noise_dimension(state),), dtype_of(state))
+        return self.perturb(state, control, normal)
+
+    def log_prob(self, state: Any, control: Any, moved: Any) -> Float[Array, ""]:
+        """Log density of a next state."""
+        deviation = local(self.move(state, control), moved)
+        return log_normal(deviation, self.covariance(state, control), jnp.ones(deviation.shape, bool))
+
+
+class Sensor(eqx.Module):
+    """The measurement density ``p(z | x)``: ``z = retract(expect(x, z), v)``, ``v ~ N(0, covariance(x, z))``.
+
+    Measurements are any pytrees: put an angle in as `SO2`, and differences wrap by themselves. `expect` and
+    `covariance` see the measurement for its identity alone (which landmark, which beacon, which beams: integer leaves),
+    never for the values read.
+    """
+
+    @abstractmethod
+    def expect(self, state: Any, measurement: Any) -> Any:
+        """What the sensor would read without noise, with the structure of the measurement."""
+
+    @abstractmethod
+    def covariance(self, state: Any, measurement: Any) -> Float[Array, "m m"]:
+        """Covariance of the noise in the tangent space of the measurement."""
+
+    def linearize(self, state: Any, measurement: Any) -> tuple[Any, Float[Array, "m d"]]:
+        """The expected measurement and its Jacobian by the tangent of the state; override where it is short."""
+        return _linearize(lambda x: self.expect(x, measurement), state)
+
+    def log_prob(self, state: Any, measurement: Any, valid: Bool[Array, "*m"]) -> Float[Array, ""]:
+        """Log density of a measurement; entries that are not valid, or not finite, count nothing.
+
+        Args:
+            state: state at which it is evaluated.
+            measurement: what was read.
+            valid: one truth value, or one for each tangent direction of the measurement.
+        """
+        residual, mask = innovation(self.expect(state, measurement), measurement, valid)
+        return log_normal(residual, self.covariance(state, measurement), mask)
+
+
+def innovation(
+    expected: Any, measurement: Any, valid: Bool[Array, "*m"]
+) -> tuple[Float[Array, " m"], Bool[Array, " m"]]:
+    """The difference of a measurement from the expected one, and which of its directions count.
+
+    Args:
+        expected: what the sensor should read.
+        measurement: what it read; entries that are not finite are masked.
+        valid: one truth value, or one for each tangent direction.
+
+    Returns:
+        ``local(expected, measurement)``, zero where masked, and the mask.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> read = jnp.array([3.0, jnp.nan])
+        >>> residual, mask = jl.beliefs.models.innovation(jnp.ones(2), read, jnp.array(True))
+        >>> residual.tolist(), mask.tolist()
+        ([2.0, 0.0], [True, False])
+    """
+    finite = jnp.isfinite(local(lax.stop_gradient(expected), lax.stop_gradient(measurement)))
+    mask = finite & jnp.broadcast_to(valid, finite.shape)
+    # Bad numbers are replaced before they are used: their derivatives would be bad as well.
+    safe = jax.tree.map(_finite_or, measurement, expected)
+    return jnp.where(mask, local(expected, safe), 0.0), mask
+
+
+def mask_covariance(covariance: Float[Array, "m m"], mask: Bool[Array, " m"]) -> Float[Array, "m m"]:
+    """The covariance with masked directions cut loose: unit variance, correlated with nothing.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> jl.beliefs.models.mask_covariance(jnp.full((2, 2), 4.0), jnp.array([True, False])).tolist()
+        [[4.0, 0.0], [0.0, 1.0]]
+    """
+    eye = jnp.eye(mask.shape[0], dtype=covariance.dtype)
+    return jnp.where(mask[:, None] & mask[None, :], covariance, eye)
+
+
+def log_normal(
+    residual: Float[Array, " m"], covariance: Float[Array, "m m"], mask: Bool[Array, " m"]
+) -> Float[Array, ""]:
+    """Log density of a residual under a normal of mean zero; masked directions count nothing.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> zero, eye = jnp.zeros(2), jnp.eye(2)
+        >>> round(float(jl.beliefs.models.log_normal(zero, eye, jnp.array([True, False]))), 3)
+        -0.919
+    """
+    root = cholesky(mask_covariance(covariance, mask))
+    squared = jnp.sum(whiten(root, jnp.where(mask, residual, 0.0)) ** 2)
+    count = jnp.sum(mask).astype(squared.dtype)
+    return -0.5 * squared - jnp.sum(jnp.log(jnp.diagonal(root))) - 0.5 * math.log(2.0 * math.pi) * count
+
+
+def dtype_of(value: Any) -> Any:
+    """The dtype of the floating arrays of a pytree.
+
+    Example:
+        >>> import jaxloc as jl
+        >>> jl.beliefs.models.dtype_of(jl.poses.SE2(0.0, 0.0, 0.0)).name
+        'float32'
+    """
+    return jnp.result_type(*[leaf for leaf in jax.tree.leaves(value) if eqx.is_inexact_array(leaf)])
+
+
+def _finite_or(value: Any, fallback: Any) -> Any:
+    if not eqx.is_inexact_array(value):
+        return value
+    return jnp.where(jnp.isfinite(value), value, lax.stop_gradient(fallback))
+
+
+def _linearize(function: Any, state: Any) -> tuple[Any, Array]:
+    image = function(state)
+
+    def in_tangent(delta):
+        return local(image, function(retract(state, delta)))
+
+    return image, jax.jacfwd(in_tangent)(jnp.zeros(tangent_dimension(state), dtype_of(state)))

@@ -1,0 +1,84 @@
+"""Pictures with the lane drawn in, one by one or as a video."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from jaxloc.data import DataError
+from jaxloc.data.io.writing import write_file
+from jaxloc.data.road_images import LaneFrame, LaneRecording
+from jaxloc.features.opencv.library import load
+
+_SEEN, _PREDICTED, _WARNING = (80, 200, 0), (0, 140, 255), (0, 0, 255)  # blue, green, red
+_WARN = 1.0  # s before a line is crossed
+
+
+def annotate(color: UInt8[np.ndarray, "h w 3"], step: Any) -> UInt8[np.ndarray, "h w 3"]:
+    """Draws the borders, and writes what was found.
+
+    Args:
+        color: the picture, in OpenCV's order of colors.
+        step: the lane in it; borders that are only predicted are orange, one that is about to be crossed is red.
+
+    Returns:
+        A new picture.
+    """
+    cv2 = load()
+    picture = color.copy()
+    thick = max(1, color.shape[1] // 400)
+    for side, columns in ((1, step.left), (-1, step.right)):
+        shade = _SEEN if step.ok else _PREDICTED
+        if step.ok and step.crossing < _WARN and step.crossing_side == side:
+            shade = _WARNING
+        points = np.clip(np.stack([columns, step.rows], axis=1), -3e4, 3e4)
+        cv2.polylines(picture, [np.rint(points * 8).astype(np.int32)[:, None]], False, shade, thick, cv2.LINE_AA, 3)
+    offset, heading, curvature, _ = step.lane
+    words = (
+        f"{offset:+.2f} m  {1e3 * heading:+.1f} mrad  {1e3 * curvature:+.2f} /km  {step.confidence:.2f} {step.source}"
+    )
+    size = color.shape[1] / 1400.0
+    place = (int(20 * size) + 2, int(36 * size) + 8)
+    for shade, width in (((0, 0, 0), 3 * thick), ((255, 255, 255), thick)):
+        cv2.putText(picture, words, place, cv2.FONT_HERSHEY_SIMPLEX, max(size, 0.3), shade, width, cv2.LINE_AA)
+    return picture
+
+
+@contextmanager
+def open_gallery(recording: LaneRecording, out: Path) -> Iterator[Callable[[LaneFrame, np.ndarray], None]]:
+    """Where annotated pictures go: a video for a video, a folder of pictures for pictures.
+
+    Args:
+        recording: what they are of.
+        out: folder for the results.
+
+    Yields:
+        A function of a frame and its annotated picture.
+
+    Raises:
+        DataError: when they cannot be written.
+    """
+    if recording.rate is None:
+        folder = out / "pictures"
+        folder.mkdir(exist_ok=True)
+        yield lambda frame, picture: _write_picture(folder / f"{Path(frame.name).stem}.jpg", picture)
+        return
+    cv2 = load()
+    path = out / "annotated.mp4"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), recording.rate, recording.shape[::-1])
+    try:
+        if not video.isOpened():
+            raise DataError(path, "cannot be written: this OpenCV has no MPEG-4 encoder")
+        yield lambda frame, picture: video.write(picture)
+    finally:
+        video.release()
+
+
+def _write_picture(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    done, data = load().imencode(".jpg", picture)
+    if not done:
+        raise DataError(path, "cannot be encoded")
+    write_file(path, data.tobytes())

@@ -1,0 +1,215 @@
+"""What a run of the localization says of itself: numbers for metrics.json and the page of the report."""
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float64, Int
+
+from jaxloc.cli import results
+from jaxloc.data import LaserLog
+from jaxloc.evaluation import plots, report
+from jaxloc.poses.planar import relative_poses
+from jaxloc.sensors import OccupancyMap
+
+_SAME_TIME = 0.02  # stamps of one instant, s
+_NUM_CLOUDS = 6
+
+
+class Reference(eqx.Module):
+    """Poses that the estimate is compared with.
+
+    Args:
+        times: increasing, s in the clock of the log.
+        poses: "n 3" (x, y, heading) of the robot in the map, m and rad.
+    """
+
+    times: Float64[np.ndarray, " n"]
+    poses: Float64[np.ndarray, "n 3"]
+
+    def match(self, times: Float64[np.ndarray, " m"]) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+        """Which of some times have a pose here, and which pose that is."""
+        after = np.clip(np.searchsorted(self.times, times), 1, max(len(self.times) - 1, 1))
+        before = after - 1
+        after = np.minimum(after, len(self.times) - 1)
+        nearest = np.where(times - self.times[before] <= self.times[after] - times, before, after)
+        indices = np.flatnonzero(np.abs(self.times[nearest] - times) <= _SAME_TIME)
+        return indices, nearest[indices]
+
+
+class Record:
+    """What a run has given so far.
+
+    Args:
+        log: the recording.
+        grid: the map.
+        reference: poses to compare with.
+    """
+
+    def __init__(self, log: LaserLog, grid: OccupancyMap, reference: Reference | None):
+        self.log = log
+        self.grid = grid
+        self.reference = reference
+        self.interrupted = False
+        self.steps: list[Any] = []
+
+    def add(self, step: Any) -> None:
+        """Adds a scan."""
+        self.steps.append(step)
+
+    def poses(self) -> np.ndarray:
+        """Estimated poses (x, y, heading)."""
+        return np.stack([step.pose for step in self.steps])
+
+    def times(self) -> np.ndarray:
+        """Stamps, s."""
+        return np.array([step.time for step in self.steps])
+
+    def found(self) -> np.ndarray:
+        """Scans at which the place was known."""
+        return np.array([step.found for step in self.steps])
+
+    def metrics(self) -> dict[str, Any]:
+        """The numbers of metrics.json: SI units, or the unit in the name."""
+        found, times, poses = self.found(), self.times(), self.poses()
+        used = [step for step in self.steps if step.updated]
+        numbers: dict[str, Any] = {
+            "scans": len(self.steps),
+            "scans_of_log": len(self.log),
+            "scans_dropped": self.log.dropped,
+            "scans_used": len(used),
+            "interrupted": self.interrupted,
+            "found_after_s": float(times[np.argmax(found)] - times[0]) if found.any() else None,
+            "found_fraction": float(found.mean()),
+            "found_at_end": bool(found[-1]),
+            "distance_m": float(np.linalg.norm(np.diff(poses[found, :2], axis=0), axis=1).sum()),
+            "median_ess": float(np.median([step.ess for step in used])),
+            "median_sigma_m": float(np.median([_sigma(step) for step in used])),
+            "most_particles": max(step.num_particles for step in used),
+            "least_particles": min(step.num_particles for step in used),
+        }
+        if self.reference is not None:
+            numbers |= self._accuracy(found)
+        return results.finite(numbers)
+
+    def errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which scans can be compared, and (x, y, heading) of the reference from the estimate there."""
+        if self.reference is None:
+            raise ValueError("There is no reference to compare with.")
+        indices, partners = self.reference.match(self.times())
+        return indices, relative_poses(self.poses()[indices], self.reference.poses[partners])
+
+    def _accuracy(self, found: np.ndarray) -> dict[str, Any]:
+        indices, errors = self.errors()
+        numbers: dict[str, Any] = {"scans_compared": len(indices)}
+        for suffix, chosen in (("", found[indices]), ("_all", np.ones(len(indices), bool))):
+            if not chosen.any():
+                continue
+            distance = np.hypot(errors[chosen, 0], errors[chosen, 1])
+            angle = np.degrees(np.abs(errors[chosen, 2]))
+            numbers |= {
+                f"error_median_m{suffix}": float(np.median(distance)),
+                f"error_95_percent_m{suffix}": float(np.percentile(distance, 95)),
+                f"error_max_m{suffix}": float(distance.max()),
+                f"error_median_deg{suffix}": float(np.median(angle)),
+                f"error_95_percent_deg{suffix}": float(np.percentile(angle, 95)),
+            }
+        return numbers
+
+    def page(self, metrics: dict[str, Any]) -> str:
+        """The page."""
+        image, poses, found = self._image(), self.poses(), self.found()
+        reference = None if self.reference is None else self.reference.poses
+        path = plots.draw_map_path(image, poses, reference, found)
+        text = "Estimated path over the map; poses from before the robot was found are dots."
+        sections = [report.Section("Path", text, path, raster=True)]
+        clouds = plots.draw_clouds(image, self._snapshots())
+        text = "The particles at several times; the arrow is the estimate" + (
+            ", the dark one the reference." if self.reference is not None else "."
+        )
+        sections.append(report.Section("Particles", text, clouds, raster=True))
+        sections += self._error_section() + self._confidence_sections()
+        sections.append(report.Section("Numbers", "SI units, or the unit in the name.", table=results.table(metrics)))
+        summary = f"{metrics['scans']} scans, {metrics['scans_used']} used."
+        if self.interrupted:
+            summary += " Interrupted: the report ends with the last scan that was processed."
+        title = f"Laser localization: {self.log.name}"
+        return report.render_report(title, sections, summary=summary, highlights=_highlights(metrics))
+
+    def _image(self) -> plots.MapImage:
+        grid = self.grid
+        origin = (float(grid.origin.x), float(grid.origin.y), float(grid.origin.theta))
+        return plots.MapImage.of(np.asarray(grid.occupied), np.asarray(grid.free), origin, float(grid.resolution))
+
+    def _snapshots(self) -> list[plots.Snapshot]:
+        """The first scans, where most happens, and some along the way."""
+        used = [step for step in self.steps if step.updated]
+        late = np.linspace(0, len(used) - 1, _NUM_CLOUDS - 2).round().astype(int)[1:]
+        chosen = sorted({0, min(1, len(used) - 1), min(3, len(used) - 1), *late.tolist()})
+        truths: dict[int, np.ndarray] = {}
+        if self.reference is not None:
+            pairs = self.reference.match(np.array([used[number].time for number in chosen]))
+            truths = {chosen[i]: self.reference.poses[j] for i, j in zip(*pairs, strict=True)}
+        begin = self.steps[0].time
+        return [
+            plots.Snapshot(
+                f"after {used[number].time - begin:.1f} s, {used[number].num_particles} particles",
+                used[number].cloud,
+                used[number].pose,
+                truths.get(number),
+            )
+            for number in chosen
+        ]
+
+    def _error_section(self) -> list[report.Section]:
+        if self.reference is None:
+            return []
+        indices, errors = self.errors()
+        if not len(indices):
+            return []
+        sigmas = np.array([_sigma(self.steps[index]) for index in indices])
+        curves = {"error": np.hypot(errors[:, 0], errors[:, 1]), "one standard deviation": sigmas}
+        times = self.times()[indices] - self.steps[0].time
+        figure = plots.draw_curves(times, curves, "position (m)", logarithmic=True)
+        return [report.Section("Error", "Distance to the reference, and what the filter believes it to be.", figure)]
+
+    def _confidence_sections(self) -> list[report.Section]:
+        used = [step for step in self.steps if step.updated]
+        times = np.array([step.time for step in used]) - self.steps[0].time
+        sizes = {
+            "effective": np.array([step.ess for step in used]),
+            "particles": np.array([float(step.num_particles) for step in used]),
+        }
+        shares = {
+            "weight of the place": np.array([step.mass for step in used]),
+            "replaced by random poses": np.array([step.inject for step in used]),
+        }
+        return [
+            report.Section(
+                "Effective sample size",
+                "How many particles carry the weight, and how many there are.",
+                plots.draw_curves(times, sizes, "particles", logarithmic=True),
+            ),
+            report.Section(
+                "Confidence",
+                "Part of the weight in the most likely place, and part of the cloud that bad fits ask to replace.",
+                plots.draw_curves(times, shares, "part"),
+            ),
+        ]
+
+
+def _sigma(step: Any) -> float:
+    """Standard deviation of the position, m."""
+    return float(np.sqrt(max(step.covariance[0, 0] + step.covariance[1, 1], 1e-12)))
+
+
+def _highlights(metrics: dict[str, Any]) -> tuple[report.Highlight, ...]:
+    wanted = (
+        ("error_median_m", "median error", "{:.3f} m"),
+        ("error_95_percent_m", "95th percentile", "{:.3f} m"),
+        ("error_median_deg", "median heading error", "{:.2f} deg"),
+        ("found_after_s", "found after", "{:.1f} s"),
+        ("distance_m", "distance", "{:.0f} m"),
+    )
+    shown = [(label, form.format(metrics[name])) for name, label, form in wanted if metrics.get(name) is not None]
+    return tuple(report.Highlight(label, value) for label, value in shown)

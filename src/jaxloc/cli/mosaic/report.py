@@ -1,0 +1,124 @@
+"""What a run of the mosaicker says of itself: numbers for metrics.json and the page of the report."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from jaxloc.cli import results
+from jaxloc.evaluation import plots, report
+from jaxloc.poses.planar import relative_poses
+
+_MOST_COLUMNS = 1200  # of the mosaic in the report
+
+
+class Record:
+    """What a run has given.
+
+    Args:
+        names: of the pictures.
+        times: their stamps, s.
+        odometry: (x, y, heading) of the camera by odometry, m and rad.
+        built: what the pipeline made of them.
+    """
+
+    def __init__(self, names: tuple[str, ...], times: np.ndarray, odometry: Float64[np.ndarray, "n 3"], built: Any):
+        self.names, self.times, self.odometry, self.built = names, times, odometry, built
+
+    def residuals(self, *, closes: bool) -> np.ndarray:
+        """What registrations that were taken and the final poses disagree by, px, with the later picture's number."""
+        poses, resolution = self.built.poses, float(self.built.mosaic.raster.resolution)
+        rows = []
+        for pair in self.built.pairs:
+            if pair.ok and pair.closes == closes:
+                final = relative_poses(poses[pair.first][None], poses[pair.second][None])
+                missed = relative_poses(final, pair.motion[None])[0]
+                rows.append((pair.second, np.hypot(missed[0], missed[1]) / resolution))
+        return np.array(rows).reshape(-1, 2)
+
+    def metrics(self) -> dict[str, Any]:
+        """The numbers of metrics.json: SI units, or the unit in the name."""
+        built, raster = self.built, self.built.mosaic.raster
+        taken = [pair for pair in built.pairs if pair.ok]
+        steps = np.linalg.norm(np.diff(built.poses[:, :2], axis=0), axis=1)
+        moved = np.linalg.norm(built.poses[:, :2] - built.before_closure[:, :2], axis=1)
+        sigma = np.sqrt(np.maximum(built.covariances[:, 0, 0] + built.covariances[:, 1, 1], 0.0))
+        left = [row[1] for closes in (False, True) for row in self.residuals(closes=closes)]
+        return results.finite(
+            {
+                "pictures": len(self.names),
+                "pictures_used": int(built.used.sum()),
+                "left_out": [self.names[number] for number in built.left_out],
+                "registrations": len(taken),
+                "registrations_refused": len(built.pairs) - len(taken),
+                "loop_closures": sum(pair.closes for pair in taken),
+                "graph_solved": bool(built.ok),
+                "resolution_m": float(raster.resolution),
+                "rows": int(raster.shape[0]),
+                "columns": int(raster.shape[1]),
+                "distance_m": float(steps.sum()),
+                "area_m2": float(np.asarray(built.mosaic.known).sum() * float(raster.resolution) ** 2),
+                "median_residual_px": float(np.median(left)) if left else None,
+                "max_residual_px": float(np.max(left)) if left else None,
+                "moved_by_closure_px": float(moved.max() / float(raster.resolution)),
+                "max_sigma_m": float(sigma[built.used].max()) if built.used.any() else None,
+            }
+        )
+
+    def page(self, metrics: dict[str, Any]) -> str:
+        """The page."""
+        picture = plots.draw_map_path(self._image(), self.built.poses, self.odometry, self.built.used)
+        text = "The mosaic with the path of the camera; the reference is its odometry, dots are pictures left out."
+        sections = [report.Section("Mosaic", text, picture, raster=True)]
+        sections += self._residual_sections()
+        if metrics["left_out"]:
+            rows = tuple((str(number), self.names[number]) for number in self.built.left_out)
+            text = "Pictures that overlap no other, or show nothing; their poses are those of the odometry."
+            sections.append(report.Section("Left out", text, table=report.Table(("number", "picture"), rows)))
+        sections.append(report.Section("Numbers", "SI units, or the unit in the name.", table=results.table(metrics)))
+        summary = (
+            f"{metrics['pictures_used']} of {metrics['pictures']} pictures, {metrics['loop_closures']} loop closures."
+        )
+        return report.render_report("Floor mosaic", sections, summary=summary, highlights=_highlights(metrics))
+
+    def _image(self) -> plots.MapImage:
+        mosaic = self.built.mosaic
+        every = max(1, -(-max(mosaic.raster.shape) // _MOST_COLUMNS))
+        values, known = (np.asarray(part)[::every, ::every] for part in (mosaic.values, mosaic.known))
+        grey = np.where(known, np.clip(values / 255.0, 0.0, 1.0), 1.0)
+        x, y = (float(number) for number in mosaic.raster.origin)
+        return plots.MapImage(grey, (x, y, 0.0), every * float(mosaic.raster.resolution))
+
+    def _residual_sections(self) -> list[report.Section]:
+        begin = self.times - self.times[0]
+        curves = {}
+        for closes, name in ((False, "neighbors"), (True, "loop closures")):
+            rows, values = self.residuals(closes=closes), np.full(len(self.names), np.nan)
+            for number, missed in rows:
+                values[int(number)] = np.fmax(values[int(number)], missed)
+            curves[name] = values
+        sigma = np.sqrt(np.maximum(self.built.covariances[:, 0, 0] + self.built.covariances[:, 1, 1], 0.0))
+        return [
+            report.Section(
+                "Residuals",
+                "What each registration and the final poses disagree by.",
+                plots.draw_curves(begin, curves, "residual (px)"),
+            ),
+            report.Section(
+                "Uncertainty",
+                "Standard deviation of each pose, by the pose graph, from the first picture.",
+                plots.draw_curves(begin, {"position": 1e3 * sigma}, "sigma (mm)"),
+            ),
+        ]
+
+
+def _highlights(metrics: dict[str, Any]) -> tuple[report.Highlight, ...]:
+    wanted = (
+        ("pictures_used", "pictures joined", "{:d}"),
+        ("loop_closures", "loop closures", "{:d}"),
+        ("median_residual_px", "median residual", "{:.3f} px"),
+        ("moved_by_closure_px", "moved by closure", "{:.2f} px"),
+        ("area_m2", "floor", "{:.2f} m2"),
+    )
+    shown = [(label, form.format(metrics[name])) for name, label, form in wanted if metrics.get(name) is not None]
+    return tuple(report.Highlight(label, value) for label, value in shown)

@@ -1,0 +1,1 @@
+"""``jaxloc track`` of stereo sequences."""

@@ -1,0 +1,142 @@
+"""Bundles on disk: the text files of stereo factors that come with GTSAM.
+
+::
+
+    VO_calibration00s.txt       fx fy skew cx cy baseline
+    VO_camera_poses00s.txt      one a line: number of the camera, 16 numbers of T_world_camera, row by row
+    VO_stereo_factors00s.txt    one a line: camera, point, u_left, u_right, v, and x y z of the point before that camera
+
+Each may be packed, with ``.gz`` behind its name.
+"""
+
+import gzip
+import zlib
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.text import check_rotations, parse_numbers, read_text
+from jaxloc.poses import SE3
+from jaxloc.refinement.bundle import Bundle, Observations
+from jaxloc.sensors import Pinhole, StereoRig
+
+# A packed file may hold at most this much text: a small one can unpack to more than the memory.
+_LARGEST = 256 * 2**20
+
+
+class StereoBundle(eqx.Module):
+    """Points seen by a stereo rig from many places.
+
+    Attributes:
+        rig: the rig.
+        start: poses of the left camera as the file has them, and points from where each was seen first.
+        observations: (u_left, u_right, v), px; sigma is 1 px.
+        camera_numbers: of the file, in the order of the poses.
+        point_numbers: of the file, in the order of the points.
+    """
+
+    rig: StereoRig
+    start: Bundle
+    observations: Observations
+    camera_numbers: Int64[np.ndarray, " c"]
+    point_numbers: Int64[np.ndarray, " n"]
+
+
+def read_stereo_factors(folder: Path | str, name: str = "00s") -> StereoBundle:
+    """Reads a bundle of stereo factors.
+
+    Args:
+        folder: where the three files lie.
+        name: what their names end with: ``VO_calibration<name>.txt`` and so on.
+
+    Returns:
+        The bundle; cameras in ascending order of their numbers, points too.
+
+    Raises:
+        DataError: when a file is missing or malformed, or the files do not fit each other.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError(folder, "no such folder")
+    rig = _read_rig(_find(folder, f"VO_calibration{name}.txt"))
+    cameras, matrices = _read_cameras(_find(folder, f"VO_camera_poses{name}.txt"))
+    path = _find(folder, f"VO_stereo_factors{name}.txt")
+    rows = _read_rows(path, 8)
+    camera, point = _whole_numbers(path, rows[:, 0], "camera"), _whole_numbers(path, rows[:, 1], "point")
+    unknown = np.flatnonzero(~np.isin(camera, cameras))
+    if unknown.size:
+        raise DataError(path, f"row {unknown[0] + 1} names camera {camera[unknown[0]]}, which has no pose")
+    flat = np.flatnonzero(~((rows[:, 2] > rows[:, 3]) & (rows[:, 7] > 0)))
+    if flat.size:
+        raise DataError(path, f"row {flat[0] + 1} has no positive disparity and depth")
+    camera = np.searchsorted(cameras, camera)
+    points, first, point = np.unique(point, return_index=True, return_inverse=True)
+    poses = matrices[camera[first]]
+    start = np.einsum("nij,nj->ni", poses[:, :3, :3], rows[first, 5:]) + poses[:, :3, 3]
+    stack = jax.vmap(SE3.from_matrix)(jnp.asarray(matrices))
+    observations = Observations.of(camera, point, rows[:, 2:5])
+    return StereoBundle(rig, Bundle(stack, jnp.asarray(start)), observations, cameras, points)
+
+
+def _find(folder: Path, name: str) -> Path:
+    packed = folder / f"{name}.gz"
+    return packed if packed.is_file() and not (folder / name).is_file() else folder / name
+
+
+def _read_rig(path: Path) -> StereoRig:
+    rows = _read_rows(path, 6)
+    if len(rows) != 1:
+        raise DataError(path, f"has {len(rows)} rows, needs one: fx fy skew cx cy baseline")
+    fx, fy, skew, cx, cy, baseline = (float(value) for value in rows[0])
+    if not (fx > 0 and fy > 0 and baseline > 0):
+        raise DataError(path, f"focal lengths {fx:g}, {fy:g} px and baseline {baseline:g} m must be positive")
+    return StereoRig(Pinhole(fx, fy, cx, cy, skew), baseline)
+
+
+def _read_cameras(path: Path) -> tuple[Int64[np.ndarray, " c"], Float64[np.ndarray, "c 4 4"]]:
+    rows = _read_rows(path, 17)
+    matrices = rows[:, 1:].reshape(-1, 4, 4)
+    check_rotations(path, matrices)
+    wrong = np.flatnonzero(np.abs(matrices[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1) > 1e-9)
+    if wrong.size:
+        raise DataError(path, f"row {wrong[0] + 1} is no pose: its last four numbers are not 0 0 0 1")
+    numbers = _whole_numbers(path, rows[:, 0], "camera")
+    cameras, order = np.unique(numbers, return_index=True)
+    if len(cameras) != len(numbers):
+        raise DataError(path, "has two poses of one camera")
+    return cameras, matrices[order]
+
+
+def _read_rows(path: Path, count: int) -> Float64[np.ndarray, "n count"]:
+    lines = (_unpack(path) if path.suffix == ".gz" else read_text(path)).splitlines()
+    rows = [parse_numbers(path, i, line.split(), count) for i, line in enumerate(lines, start=1) if line.strip()]
+    if not rows:
+        raise DataError(path, "is empty")
+    return np.array(rows, dtype=np.float64)
+
+
+def _unpack(path: Path) -> str:
+    try:
+        with gzip.open(path, "rb") as file:
+            content = file.read(_LARGEST + 1)
+        if len(content) > _LARGEST:
+            raise DataError(path, f"unpacks to more than {_LARGEST // 2**20} MiB")
+        return content.decode("utf-8-sig")
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise DataError(path, "is no gzip file, or a damaged one") from error
+    except OSError as error:
+        raise DataError(path, f"cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(path, "is no text file") from error
+
+
+def _whole_numbers(path: Path, values: Float64[np.ndarray, " n"], what: str) -> Int64[np.ndarray, " n"]:
+    wrong = np.flatnonzero((values != np.round(values)) | (np.abs(values) > 2**53))
+    if wrong.size:
+        raise DataError(path, f"row {wrong[0] + 1} has {values[wrong[0]]:g} as the number of a {what}")
+    return values.astype(np.int64)

@@ -1,0 +1,21 @@
+"""The error that readers raise."""
+
+from pathlib import Path
+
+
+class DataError(ValueError):
+    """Input that cannot be used: one line that names the file and says what is wrong with it.
+
+    Args:
+        path: the file or folder at fault.
+        what: what is wrong, and what is needed instead.
+
+    Example:
+        >>> print(DataError("calib.txt", "has no line P1:"))
+        calib.txt: has no line P1:
+    """
+
+    def __init__(self, path: Path | str, what: str):
+        super().__init__(f"{path}: {what}")
+        self.path = Path(path)
+        self.what = what

@@ -1,0 +1,100 @@
+"""Files that are never half-written: whole, or not there.
+
+Everything is written beside its place under a temporary name and moved there in one step, so that a reader never
+sees half a file and a failed run leaves the files of the run before it.
+"""
+
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+from jaxloc.data.io.errors import DataError
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.partial")
+
+
+def write_file(path: Path | str, content: str | bytes) -> None:
+    """Writes a file in one step, over one that may be there.
+
+    Args:
+        path: the file.
+        content: text (written as UTF-8) or bytes.
+
+    Raises:
+        DataError: when the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_file(Path(folder) / "a.txt", "one")
+        ...     (Path(folder) / "a.txt").read_text()
+        'one'
+    """
+    path = Path(path)
+    temporary = _temporary(path)
+    try:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise DataError(path, f"cannot be written: {error.strerror}") from error
+
+
+class RowWriter:
+    r"""A text file that grows by whole rows, and takes its place when the block that writes it ends.
+
+    An interrupt (Ctrl-C) keeps the rows written so far; any other error throws them away and leaves the file that was
+    there before.
+
+    Args:
+        path: the file.
+        header: its first line or lines, without the last line end.
+
+    Raises:
+        DataError: when the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with RowWriter(Path(folder) / "a.csv", header="frame") as rows:
+        ...         rows.append("0")
+        ...     (Path(folder) / "a.csv").read_text()
+        'frame\n0\n'
+    """
+
+    def __init__(self, path: Path | str, header: str | None = None):
+        self.path = Path(path)
+        self._header = header
+        self._file: TextIO | None = None
+
+    def __enter__(self) -> "RowWriter":
+        try:
+            self._file = _temporary(self.path).open("w", encoding="utf-8", newline="\n")
+        except OSError as error:
+            raise DataError(self.path, f"cannot be written: {error.strerror}") from error
+        if self._header is not None:
+            self.append(self._header)
+        return self
+
+    def append(self, row: str) -> None:
+        """Adds a row; it is in the file when this returns."""
+        if self._file is None:
+            raise ValueError(f"{self.path} is not open: append rows inside the writer's with block.")
+        self._file.write(f"{row}\n")
+        self._file.flush()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+        if kind is None or issubclass(kind, KeyboardInterrupt | GeneratorExit):
+            os.replace(_temporary(self.path), self.path)
+        else:
+            _temporary(self.path).unlink(missing_ok=True)

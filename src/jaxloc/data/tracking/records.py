@@ -1,0 +1,279 @@
+"""What a detector found in each frame, and what was really there: one record for all formats of files.
+
+Every frame has the same room; `valid` says which slots count, and the others hold zeros. Frames that a file does not
+name are empty. Host code: arrays are NumPy's.
+"""
+
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from jaxloc.data.io.errors import DataError
+
+_MOST_FRAMES = 10**6  # a frame number beyond this is a broken line
+
+
+class Detections(eqx.Module):
+    """Detections by frame, "t m": those of a frame stand first, the surest one first of all.
+
+    Attributes:
+        frames: numbers of the frames.
+        times: s since the first frame of the recording.
+        valid: which slots hold a detection.
+        boxes: (left, top, right, bottom) in the image, px.
+        scores: of the detector, in its own units.
+        types: rows of `names`; -1 where not valid.
+        names: of the types.
+        left_out: how many of a frame were not used: bad numbers, boxes without area, no room.
+        camera: positions in the rectified frame of camera 0 (x right, y down, z forward), m; None for pictures alone.
+        positions: the same in the world, the frame of the first camera pose, m.
+        sizes: height, width, length, m.
+        headings: direction of the length in the world, rad: from the world's x axis towards its -z axis.
+    """
+
+    frames: Int64[np.ndarray, " t"]
+    times: Float64[np.ndarray, " t"]
+    valid: Bool[np.ndarray, "t m"]
+    boxes: Float64[np.ndarray, "t m 4"]
+    scores: Float64[np.ndarray, "t m"]
+    types: Int64[np.ndarray, "t m"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    left_out: Int64[np.ndarray, " t"]
+    camera: Float64[np.ndarray, "t m 3"] | None = None
+    positions: Float64[np.ndarray, "t m 3"] | None = None
+    sizes: Float64[np.ndarray, "t m 3"] | None = None
+    headings: Float64[np.ndarray, "t m"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def select(self, kept: Bool[np.ndarray, "t m"]) -> "Detections":
+        """The same with fewer valid slots, such as those of a score; nothing moves.
+
+        Example:
+            >>> import jaxloc as jl, numpy as np
+            >>> boxes = np.array([[0.0, 0.0, 2.0, 2.0], [1.0, 1.0, 3.0, 3.0]])
+            >>> rows = jl.data.tracking.records.Rows(np.array([1, 2]), np.array([0, 0]), boxes, np.array([0.2, 0.9]))
+            >>> found = jl.data.tracking.records.assemble("file", rows, rate=10.0)
+            >>> found.select(found.scores > 0.5).valid.tolist()
+            [[True, False]]
+        """
+        return eqx.tree_at(lambda d: d.valid, self, self.valid & kept)
+
+
+class Rows(eqx.Module):
+    """What a file says, row by row.
+
+    Attributes:
+        lines: of the file, counted from 1.
+        frames: numbers of the frames.
+        boxes: left, top, right, bottom.
+        scores: the larger, the surer.
+        ids: who it is, where that is known.
+        types: rows of the names of the types.
+        solids: height, width, length, x, y, z (camera), rotation about the camera's y axis.
+    """
+
+    lines: Int64[np.ndarray, " n"]
+    frames: Int64[np.ndarray, " n"]
+    boxes: Float64[np.ndarray, "n 4"]
+    scores: Float64[np.ndarray, " n"]
+    ids: Int64[np.ndarray, " n"] | None = None
+    types: Int64[np.ndarray, " n"] | None = None
+    solids: Float64[np.ndarray, "n 7"] | None = None
+
+    def usable(self) -> Bool[np.ndarray, " n"]:
+        """Rows whose numbers are finite; boxes need an area, but for solids, which may lie outside the picture."""
+        good = np.isfinite(self.boxes).all(axis=1) & np.isfinite(self.scores)
+        if self.solids is not None:
+            return good & np.isfinite(self.solids).all(axis=1)
+        return good & (self.boxes[:, 2] > self.boxes[:, 0]) & (self.boxes[:, 3] > self.boxes[:, 1])
+
+
+class LabelledTracks(eqx.Module):
+    """Detections whose identity is known: true tracks, or those of a tracker.
+
+    Attributes:
+        detections: what is there.
+        ids: "t m" who it is; -1 where not valid.
+    """
+
+    detections: Detections
+    ids: Int64[np.ndarray, "t m"]
+
+    def identities(self) -> Int64[np.ndarray, " n"]:
+        """Who is there at all, in order."""
+        return np.unique(self.ids[self.detections.valid])
+
+    def slots(self) -> tuple[Int64[np.ndarray, "n t"], Bool[np.ndarray, "n t"]]:
+        """Where each identity stands in each frame: its slot, and whether it is there."""
+        present = self.detections.valid[None] & (self.ids[None] == self.identities()[:, None, None])
+        if not present.size:
+            return np.zeros(present.shape[:2], np.int64), np.zeros(present.shape[:2], bool)
+        return present.argmax(axis=2), present.any(axis=2)
+
+    def by_identity(self, values: Float64[np.ndarray, "t m *d"]) -> Float64[np.ndarray, "n t *d"]:
+        """A field of the detections as tracks: by identity, then by frame; zero where it is not there."""
+        slots, there = self.slots()
+        if not values.shape[1]:
+            return np.zeros((*slots.shape, *values.shape[2:]))
+        picked = values[np.arange(values.shape[0])[None], slots]
+        return np.where(there.reshape(*there.shape, *(1,) * (values.ndim - 2)), picked, 0.0)
+
+
+def assemble(
+    path: Path | str,
+    rows: Rows,
+    *,
+    rate: float,
+    first: int = 0,
+    num_frames: int | None = None,
+    capacity: int | None = None,
+    names: tuple[str, ...] = ("object",),
+    poses: Float64[np.ndarray, "t 4 4"] | None = None,
+) -> Detections:
+    """Puts rows of a file into frames; rows that are not usable, or find no room, are left out and counted.
+
+    Args:
+        path: the file, for errors.
+        rows: of the file.
+        rate: frames a second.
+        first: number of the first frame.
+        num_frames: how many frames there are; up to the last row where not given.
+        capacity: room of a frame; that of the fullest where not given. The surest stay.
+        names: of the types.
+        poses: T_world_camera of each frame; the identity where not given.
+
+    Returns:
+        The detections.
+
+    Raises:
+        DataError: when there are more frames than there should be, or fewer poses than frames.
+    """
+    table = _table(path, rows, first, num_frames, capacity)
+    valid = table >= 0
+    count = len(table)
+    types = np.zeros(len(rows.frames), np.int64) if rows.types is None else rows.types
+    return Detections(
+        first + np.arange(count),
+        np.arange(count) / rate,
+        valid,
+        _spread(rows.boxes, table),
+        _spread(rows.scores, table),
+        np.where(valid, _spread(types, table), -1),
+        names,
+        np.bincount(rows.frames - first, minlength=count) - valid.sum(axis=1),
+        *(() if rows.solids is None else _solids(path, _spread(rows.solids, table), valid, poses)),
+    )
+
+
+def assemble_tracks(
+    path: Path | str,
+    rows: Rows,
+    *,
+    rate: float,
+    first: int = 0,
+    num_frames: int | None = None,
+    names: tuple[str, ...] = ("object",),
+    poses: Float64[np.ndarray, "t 4 4"] | None = None,
+) -> LabelledTracks:
+    """The same for rows with identities, all of which must be usable.
+
+    Args:
+        path: the file, for errors.
+        rows: of the file.
+        rate: frames a second.
+        first: number of the first frame.
+        num_frames: how many frames there are; up to the last row where not given.
+        names: of the types.
+        poses: T_world_camera of each frame; the identity where not given.
+
+    Returns:
+        The tracks.
+
+    Raises:
+        DataError: as `assemble`, and when a row is not usable, or an identity is there twice in a frame.
+    """
+    if rows.ids is None:
+        raise ValueError("Tracks need rows with identities.")
+    broken = np.flatnonzero(~rows.usable())
+    if broken.size:
+        raise DataError(path, f"line {rows.lines[broken[0]]} holds a number that is not finite, or a box without area")
+    pairs = np.column_stack([rows.frames, rows.ids])
+    again = np.setdiff1d(np.arange(len(pairs)), np.unique(pairs, axis=0, return_index=True)[1])
+    if again.size:
+        frame, identity = pairs[again[0]]
+        raise DataError(path, f"line {rows.lines[again[0]]}: identity {identity} is there twice in frame {frame}")
+    found = assemble(path, rows, rate=rate, first=first, num_frames=num_frames, names=names, poses=poses)
+    table = _table(path, rows, first, num_frames, None)
+    return LabelledTracks(found, np.where(found.valid, _spread(rows.ids, table), -1))
+
+
+def check_frame(path: Path | str, line: int, value: float, first: int) -> int:
+    """The number of a frame.
+
+    Args:
+        path: the file, for the error.
+        line: of the file, for the error.
+        value: what stands there.
+        first: number of the first frame.
+
+    Returns:
+        The number.
+
+    Raises:
+        DataError: when it is none.
+    """
+    if not (first <= value < _MOST_FRAMES and value == int(value)):
+        raise DataError(path, f"line {line}: {value:g} is no frame number (whole, from {first})")
+    return int(value)
+
+
+def _table(
+    path: Path | str, rows: Rows, first: int, num_frames: int | None, capacity: int | None
+) -> Int64[np.ndarray, "t m"]:
+    """The row in each slot of each frame; -1 where there is none."""
+    frames = rows.frames - first
+    last = int(frames.max(initial=-1))
+    count = last + 1 if num_frames is None else num_frames
+    if last >= count:
+        line = rows.lines[frames.argmax()]
+        raise DataError(path, f"line {line}: frame {last + first} is beyond the last of {count} frames")
+    used = np.flatnonzero(rows.usable())
+    used = used[np.lexsort((-rows.scores[used], frames[used]))]
+    starts = np.searchsorted(frames[used], np.arange(count))
+    slots = np.arange(len(used)) - starts[frames[used]]
+    room = int(slots.max(initial=-1)) + 1 if capacity is None else capacity
+    kept = slots < room
+    table = np.full((count, room), -1, np.int64)
+    table[frames[used[kept]], slots[kept]] = used[kept]
+    return table
+
+
+def _spread(values: np.ndarray, table: Int64[np.ndarray, "t m"]) -> np.ndarray:
+    """Values of rows in their slots; zero where there is none."""
+    spread = np.zeros((*table.shape, *values.shape[1:]), values.dtype)
+    spread[table >= 0] = values[table[table >= 0]]
+    return spread
+
+
+def _solids(
+    path: Path | str,
+    solids: Float64[np.ndarray, "t m 7"],
+    valid: Bool[np.ndarray, "t m"],
+    poses: Float64[np.ndarray, "k 4 4"] | None,
+) -> tuple[np.ndarray, ...]:
+    """Positions in the camera and in the world, sizes, and headings in the world."""
+    count = len(solids)
+    poses = np.tile(np.eye(4), (count, 1, 1)) if poses is None else poses
+    if len(poses) < count:
+        raise DataError(path, f"has {count} frames, but there are {len(poses)} poses")
+    rotations, translations = poses[:count, :3, :3], poses[:count, :3, 3]
+    camera, turn = solids[..., 3:6], solids[..., 6]
+    world = np.einsum("tij,tmj->tmi", rotations, camera) + translations[:, None]
+    along = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=-1)
+    ahead = np.einsum("tij,tmj->tmi", rotations, along)
+    headings = np.where(valid, np.arctan2(-ahead[..., 2], ahead[..., 0]), 0.0)
+    return camera, np.where(valid[..., None], world, 0.0), solids[..., :3], headings

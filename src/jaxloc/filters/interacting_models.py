@@ -1,0 +1,320 @@
+"""Things that change how they move: a bank of filters, one for each mode of motion, that interact."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from jaxloc.beliefs import Gaussian
+from jaxloc.beliefs.square_root import cholesky, product, triangularize, whiten
+from jaxloc.filters.interface import Filter, FilterState, GaussianInfo, GaussianState, History, Info
+from jaxloc.filters.kalman import GaussianFilter, finite_or_zero, recenter, select
+from jaxloc.filters.smoothers import Step, regress, smooth_step
+from jaxloc.filters.unscented import intrinsic_mean
+from jaxloc.poses import carry, is_flat, local
+
+
+class ModesState(FilterState):
+    """A state in each mode, and how probable the modes are.
+
+    Attributes:
+        states: one `GaussianState` a mode, stacked along a leading axis.
+        log_probabilities: of the modes.
+        step: how many predictions led here.
+    """
+
+    states: GaussianState
+    log_probabilities: Float[Array, " k"]
+    step: Int[Array, ""]
+
+    @property
+    def probabilities(self) -> Float[Array, "*s k"]:
+        """Of the modes; they add up to one."""
+        return jnp.exp(self.log_probabilities)
+
+    def combined(self) -> GaussianState:
+        """One normal density with the moments of all modes together."""
+        return mix(self.states, self.probabilities)
+
+    def gaussian(self) -> Gaussian:
+        """The same as a `Gaussian`."""
+        return self.combined().gaussian()
+
+
+class ModesInfo(Info):
+    """What an update of a bank of filters says.
+
+    Attributes:
+        log_likelihood: of the measurement given all earlier ones; zero where there is none.
+        ok: whether the state can be used.
+        probabilities: of the modes, after the update.
+        modes: what the filter of each mode says, stacked along a leading axis.
+    """
+
+    log_likelihood: Float[Array, ""]
+    ok: Bool[Array, ""]
+    probabilities: Float[Array, " k"]
+    modes: GaussianInfo
+
+
+class InteractingFilters(Filter):
+    """The interacting multiple model (IMM) filter: one filter of the Kalman family a mode, mixed before each step.
+
+    The mode is a Markov chain, ``p(s' = j | s = i) = transition[i, j]``. A prediction mixes the states of all modes for
+    each mode, by the probability that it was reached from them, and moves them by the filter of that mode; an update
+    weighs modes by the likelihood of the measurement.
+
+    Args:
+        filters: one for each mode, all on the same state; of any kind (linear, extended, sigma-point).
+        transition: mode transition matrix "k k", rows that add up to one; may be learned.
+
+    Raises:
+        ValueError: if the transition matrix does not fit the number of filters.
+
+    References:
+        Blom and Bar-Shalom, "The interacting multiple model algorithm for systems with Markovian switching
+        coefficients", IEEE TAC 1988; Thesis eq. 1.3 and Fig. 1.3 [T-6].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> sensor = jl.filters.LinearSensor(jnp.eye(1, 2), 0.01 * jnp.eye(1))
+        >>> calm, wild = (jl.filters.KalmanFilter(jl.filters.ConstantVelocity(q, axes=1), sensor) for q in (1e-4, 10.0))
+        >>> filt = jl.filters.InteractingFilters((calm, wild), jnp.array([[0.9, 0.1], [0.1, 0.9]]))
+        >>> state = filt.init(jl.beliefs.Gaussian(jnp.zeros(2), 0.01 * jnp.eye(2)))
+        >>> state, info = filt.update(filt.predict(state, jnp.array(1.0)), jnp.array([2.0]), jnp.array(True))
+        >>> bool(info.probabilities[1] > 0.9)
+        True
+    """
+
+    filters: tuple[GaussianFilter, ...]
+    transition: Float[Array, "k k"]
+
+    def __check_init__(self):
+        count = len(self.filters)
+        if isinstance(self.transition, jax.Array) and self.transition.shape != (count, count):
+            raise ValueError(
+                f"{count} filters need a transition matrix of shape ({count}, {count}); got {self.transition.shape}."
+            )
+
+    def init(self, prior: Gaussian, probabilities: Float[Array, " k"] | None = None) -> ModesState:
+        """The state of a prior density.
+
+        Args:
+            prior: of the state in every mode.
+            probabilities: of the modes; None for equal ones.
+        """
+        count = len(self.filters)
+        if probabilities is None:
+            probabilities = jnp.full(count, 1.0 / count, self.transition.dtype)
+        states = _stack([filt.init(prior) for filt in self.filters])
+        return ModesState(states, log_probability(probabilities), jnp.zeros((), jnp.int32))
+
+    def predict(self, state: ModesState, control: Any, *, key: Key[Array, ""] | None = None) -> ModesState:
+        """The state one step later: mixed for each mode, then moved by its filter."""
+        del key
+        joint = state.log_probabilities[:, None] + log_probability(self.transition)
+        predicted = jax.nn.logsumexp(joint, axis=0)
+        weights = jnp.exp(joint - predicted[None, :])
+        mixed = jax.vmap(mix, in_axes=(None, 1))(state.states, weights)
+        moved = [filt.predict(one, control) for filt, one in zip(self.filters, unstack(mixed), strict=True)]
+        return ModesState(_stack(moved), predicted, state.step + 1)
+
+    def update(
+        self, state: ModesState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
+    ) -> tuple[ModesState, ModesInfo]:
+        """The state given a measurement."""
+        del key
+        pairs = [
+            filt.update(one, measurement, valid) for filt, one in zip(self.filters, unstack(state.states), strict=True)
+        ]
+        states, infos = _stack([pair[0] for pair in pairs]), _stack([pair[1] for pair in pairs])
+        joint = state.log_probabilities + infos.log_likelihood
+        likelihood = jax.nn.logsumexp(joint)
+        ok = jnp.all(infos.ok)
+        log_probabilities = jnp.where(ok, joint - likelihood, state.log_probabilities)
+        after = ModesState(states, log_probabilities, state.step)
+        return after, ModesInfo(jnp.where(ok, likelihood, 0.0), ok, after.probabilities, infos)
+
+
+@eqx.filter_jit
+def smooth_modes(
+    filt: InteractingFilters, history: History, controls: Any, *, active: Bool[Array, " t"] | None = None
+) -> ModesState:
+    """Modes and states of a run given all its measurements: the IMM smoother.
+
+    Going back a step, what later measurements say of the state after it is taken for each mode as the ratio of its
+    smoothed and its predicted density. Each pair of modes (before, after) is smoothed with that; pairs are weighed by
+    the transition matrix and by how well their prediction fits, and those with the same mode before are merged.
+
+    Args:
+        filt: the filter of the run.
+        history: of the run, with whole states.
+        controls: those of the run.
+        active: that of the run.
+
+    Returns:
+        Smoothed states, stacked along the steps.
+
+    References:
+        Helmick, Blair and Hoffman, "Fixed-interval smoothing for Markovian switching systems", IEEE TIT 1995;
+        Nadarajah, Tharmarasa, McDonald and Kirubarajan, "IMM forward filtering and backward smoothing for maneuvering
+        target tracking", IEEE TAES 2012 [T-6].
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> sensor = jl.filters.LinearSensor(jnp.eye(1, 2), 0.01 * jnp.eye(1))
+        >>> calm, wild = (jl.filters.KalmanFilter(jl.filters.ConstantVelocity(q, axes=1), sensor) for q in (1e-4, 10.0))
+        >>> filt = jl.filters.InteractingFilters((calm, wild), jnp.array([[0.9, 0.1], [0.1, 0.9]]))
+        >>> start = filt.init(jl.beliefs.Gaussian(jnp.zeros(2), 0.01 * jnp.eye(2)))
+        >>> dt, z = jnp.ones(4), jnp.array([[0.0], [0.0], [2.0], [4.0]])
+        >>> _, history = jl.filters.run(filt, start, dt, z, jnp.ones(4, bool))
+        >>> jl.filters.smooth_modes(filt, history, dt).probabilities.shape
+        (4, 2)
+    """
+    states = history.states
+    there = jnp.ones(states.step.shape[:1], bool) if active is None else active
+    last = jax.tree.map(lambda leaf: leaf[-1], states)
+    before = jax.tree.map(lambda leaf: leaf[:-1], states)
+    after = jax.tree.map(lambda leaf: leaf[1:], (finite_or_zero(controls), there))
+
+    def back(smoothed, inputs):
+        state, (control, here) = inputs
+        earlier = _smooth_back(filt, state, control, smoothed)
+        held = ModesState(_renumber(smoothed.states, state.step), smoothed.log_probabilities, state.step)
+        earlier = select(here, earlier, held)
+        return earlier, earlier
+
+    _, smoothed = lax.scan(back, last, (before, after), reverse=True)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), smoothed, last)
+
+
+def _smooth_back(filt: InteractingFilters, state: ModesState, control: Any, smoothed: ModesState) -> ModesState:
+    """One step back of the smoother, over all pairs (mode before, mode after)."""
+    predicted, pairs, scores = filt.predict(state, control), [], []
+    for mode, expected, after in zip(filt.filters, unstack(predicted.states), unstack(smoothed.states), strict=True):
+        evidence = gather(expected, after)
+
+        def pair(before, mode=mode, evidence=evidence):
+            spread = mode.move(before, control)
+            root, size = spread.root(), spread.image.shape[0]
+            moved = GaussianState(spread.mean, root[:size, :size], before.step)
+            revised, score = revise(moved, evidence)
+            return smooth_step(before, Step(spread.mean, *regress(root)), revised), score
+
+        earlier, score = jax.vmap(pair)(state.states)
+        pairs.append(earlier)
+        scores.append(score)
+    # [after, before]
+    joint = jnp.stack(scores) + (state.log_probabilities[:, None] + log_probability(filt.transition)).T
+    joint = jax.nn.log_softmax(joint, axis=1) + smoothed.log_probabilities[:, None]
+    total = jax.nn.logsumexp(joint, axis=0)
+    weights = jnp.exp(joint - total[None, :])
+    merged = jax.vmap(mix, in_axes=(1, 1))(_stack(pairs), weights)
+    return ModesState(_renumber(merged, state.step), total, state.step)
+
+
+class Evidence(eqx.Module):
+    """What later measurements say of a state: in sigmas y of its prediction, ``log p = score y - |root^T y|^2 / 2``.
+
+    Attributes:
+        center: mean and root of the prediction, which define y.
+        free: directions in which the prediction is uncertain.
+        score, root: of the log likelihood.
+    """
+
+    center: GaussianState
+    free: Bool[Array, " d"]
+    score: Float[Array, " d"]
+    root: Float[Array, "d d"]
+
+
+def gather(predicted: GaussianState, smoothed: GaussianState) -> Evidence:
+    """What turned a prediction into the smoothed state: the ratio of both densities."""
+    root = predicted.covariance_sqrt
+    info, scale = jnp.finfo(root.dtype), jnp.sqrt(jnp.sum(lax.stop_gradient(root) ** 2, axis=1))
+    # Directions that are known without noise (an acceleration held at zero) carry no evidence.
+    free = jnp.diagonal(root) > jnp.maximum(8.0 * float(info.eps) * scale, float(info.tiny) ** 0.25)
+    center = GaussianState(predicted.mean, _pinned(root, free), predicted.step)
+    shift, spread = _in_sigmas(center, free, smoothed)
+    eye = jnp.eye(shift.shape[0], dtype=root.dtype)
+    inverse = whiten(_pinned(triangularize(spread), free), eye)
+    gained = product(inverse.T, inverse)
+    return Evidence(center, free, product(gained, shift), cholesky(gained - eye))
+
+
+def revise(state: GaussianState, evidence: Evidence) -> tuple[GaussianState, Float[Array, ""]]:
+    """A density times a likelihood of later measurements: the product, and the logarithm of its mass."""
+    center, known = evidence.center, evidence.root
+    shift, spread = _in_sigmas(center, evidence.free, state)
+    size = shift.shape[0]
+    seen = product(known.T, spread)
+    scale = triangularize(jnp.concatenate([seen.T, jnp.eye(size, dtype=shift.dtype)], axis=1))
+    slope = evidence.score - product(known, product(known.T, shift))
+    step = whiten(scale, product(spread.T, slope))
+    root = whiten(scale, spread.T).T
+    mass = jnp.sum(evidence.score * shift) - 0.5 * jnp.sum(product(known.T, shift) ** 2)
+    mass = mass + 0.5 * jnp.sum(step**2) - jnp.sum(jnp.log(jnp.diagonal(scale)))
+    delta = product(center.covariance_sqrt, jnp.where(evidence.free, shift + product(root, step), 0.0))
+    mean, root = recenter(center.mean, delta, triangularize(product(center.covariance_sqrt, root)))
+    return GaussianState(mean, root, state.step), mass
+
+
+def _in_sigmas(
+    center: GaussianState, free: Bool[Array, " d"], state: GaussianState
+) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
+    """Mean and root of a state in the sigmas of another."""
+    shift, root = local(center.mean, state.mean), state.covariance_sqrt
+    if not is_flat(center.mean):
+        root = product(carry(state.mean, jnp.zeros_like(shift), center.mean), root)
+    white = whiten(center.covariance_sqrt, jnp.concatenate([shift[:, None], root], axis=1))
+    white = jnp.where(free[:, None], white, 0.0)
+    return white[:, 0], white[:, 1:]
+
+
+def _pinned(root: Float[Array, "d d"], free: Bool[Array, " d"]) -> Float[Array, "d d"]:
+    """A root that can be divided by: directions that are not free are cut loose, at one sigma."""
+    return jnp.where(free[:, None] & free[None, :], root, jnp.eye(free.shape[0], dtype=root.dtype))
+
+
+def mix(states: GaussianState, weights: Float[Array, " k"]) -> GaussianState:
+    """One normal density with the mean and covariance of a mixture.
+
+    Args:
+        states: stacked along a leading axis.
+        weights: that add up to one.
+
+    Returns:
+        The state, with an intrinsic mean on manifolds.
+    """
+    mean, deviations = intrinsic_mean(states.mean, weights)
+    roots = states.covariance_sqrt
+    if not is_flat(mean):
+        zero = jnp.zeros(deviations.shape[1], deviations.dtype)
+        roots = jax.vmap(lambda center, root: product(carry(center, zero, mean), root))(states.mean, roots)
+    # The square root of a weight that underflows to zero has no derivative there.
+    positive = weights > 0.0
+    scale = jnp.where(positive, jnp.sqrt(jnp.where(positive, weights, 1.0)), 0.0)
+    columns = jnp.concatenate([jnp.moveaxis(roots, 0, 1), deviations.T[:, :, None]], axis=2) * scale[None, :, None]
+    return GaussianState(mean, triangularize(columns.reshape(columns.shape[0], -1)), states.step[0])
+
+
+def log_probability(probabilities: Float[Array, "*k"]) -> Float[Array, "*k"]:
+    """The logarithm, with impossible events at a finite bound."""
+    return jnp.log(jnp.maximum(probabilities, float(jnp.finfo(probabilities.dtype).tiny)))
+
+
+def unstack(states: GaussianState) -> list[GaussianState]:
+    """The states of a stack."""
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in range(states.step.shape[0])]
+
+
+def _stack(items: list[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
+
+
+def _renumber(states: GaussianState, step: Int[Array, ""]) -> GaussianState:
+    numbers = jnp.broadcast_to(step[None], states.step.shape)
+    return jax.vmap(GaussianState)(states.mean, states.covariance_sqrt, numbers)

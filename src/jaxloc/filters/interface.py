@@ -1,0 +1,167 @@
+"""The four verbs of every filter: init, predict, update, run."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from jaxloc.beliefs import Gaussian
+from jaxloc.poses.lie_group import matmul
+
+
+class FilterState(eqx.Module):
+    """What the next step of a filter needs; each kind of filter has its own.
+
+    Attributes:
+        step: how many predictions led here; it numbers the random keys, so that a resumed run draws as one pass does.
+    """
+
+    step: eqx.AbstractVar[Int[Array, ""]]
+
+
+class GaussianState(FilterState):
+    """A normal density in square-root form: what the Kalman family carries.
+
+    Attributes:
+        mean: a vector, a pose, or any pytree of them.
+        covariance_sqrt: lower triangular root of the covariance in the tangent space of the mean.
+        step: how many predictions led here.
+    """
+
+    mean: Any
+    covariance_sqrt: Float[Array, "d d"]
+    step: Int[Array, ""]
+
+    @property
+    def covariance(self) -> Float[Array, "*s d d"]:
+        """Of the tangent at the mean; symmetric and never negative, being a product of the root with itself."""
+        return matmul(self.covariance_sqrt, self.covariance_sqrt.mT)
+
+    def gaussian(self) -> Gaussian:
+        """The state as a density."""
+        return Gaussian(self.mean, self.covariance)
+
+
+class Info(eqx.Module):
+    """What people want to know of one update.
+
+    Attributes:
+        log_likelihood: of the measurement given all earlier ones; zero where there is none.
+        ok: whether the state can be used; False after bad numbers, where the state is the predicted one.
+    """
+
+    log_likelihood: eqx.AbstractVar[Float[Array, ""]]
+    ok: eqx.AbstractVar[Bool[Array, ""]]
+
+
+class GaussianInfo(Info):
+    """What an update of the Kalman family says.
+
+    Attributes:
+        log_likelihood: of the measurement given all earlier ones; zero where there is none.
+        ok: whether the state can be used.
+        innovation: measured minus expected, in the tangent space of the measurement, zero where masked.
+        innovation_covariance: its predicted covariance; unit variance where masked.
+        nis: normalized innovation squared, chi-square with `dof` degrees of freedom when the model is right.
+        dof: number of valid directions.
+        accepted: whether the measurement passed the gate (True without one).
+    """
+
+    log_likelihood: Float[Array, ""]
+    ok: Bool[Array, ""]
+    innovation: Float[Array, " m"]
+    innovation_covariance: Float[Array, "m m"]
+    nis: Float[Array, ""]
+    dof: Int[Array, ""]
+    accepted: Bool[Array, ""]
+
+
+class Filter(eqx.Module):
+    """A recursive estimator: a pytree of its models, with three pure verbs; `run` is the fourth."""
+
+    @abstractmethod
+    def init(self, prior: Any) -> Any:
+        """The state before any data, from a prior such as a `Gaussian`."""
+
+    @abstractmethod
+    def predict(self, state: Any, control: Any, *, key: Key[Array, ""] | None = None) -> Any:
+        """The state one step later, before its measurement."""
+
+    @abstractmethod
+    def update(
+        self, state: Any, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
+    ) -> tuple[Any, Any]:
+        """The state given a measurement, and an `Info`; nothing changes where the measurement is not valid."""
+
+
+class History(eqx.Module):
+    """A run step by step, stacked along a leading axis.
+
+    Attributes:
+        states: after each update (or what `keep` made of them).
+        infos: of each update.
+    """
+
+    states: Any
+    infos: Any
+
+
+def _whole(state: Any) -> Any:
+    return state
+
+
+@eqx.filter_jit
+def run(
+    filt: Filter,
+    state: Any,
+    controls: Any,
+    measurements: Any,
+    valid: Bool[Array, "t *m"],
+    *,
+    active: Bool[Array, " t"] | None = None,
+    keep: Callable[[Any], Any] = _whole,
+    key: Key[Array, ""] | None = None,
+) -> tuple[Any, History]:
+    """A pass over a recording: for each step `predict`, then `update`, in one scan.
+
+    Args:
+        filt: any `Filter`.
+        state: where to begin, `filt.init(prior)` or the state that an earlier run ended in. A resumed run continues to
+            the same numbers as one pass.
+        controls: stacked along the steps, such as the ``dt`` of each; or None.
+        measurements: stacked along the steps.
+        valid: which measurements there are: one truth value a step, or one for each tangent direction of each.
+        active: which steps there are. A step that is not leaves the state as it was, so that padded sequences of any
+            length share one program. None for all.
+        keep: what of each state the history holds, such as an estimate instead of all particles.
+        key: random key of filters that draw.
+
+    Returns:
+        The last state, and the `History`.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> eye = jnp.eye(1)
+        >>> filt = jl.filters.KalmanFilter(jl.filters.LinearMotion(eye, eye), jl.filters.LinearSensor(eye, eye))
+        >>> state = filt.init(jl.beliefs.Gaussian(jnp.zeros(1), eye))
+        >>> state, history = jl.filters.run(filt, state, None, jnp.ones((5, 1)), jnp.ones(5, bool))
+        >>> history.infos.log_likelihood.shape
+        (5,)
+    """
+    there = jnp.ones(valid.shape[:1], bool) if active is None else active
+
+    def advance(before, inputs):
+        control, measurement, valid_here, here = inputs
+        keys = (None, None) if key is None else jax.random.split(jax.random.fold_in(key, before.step))
+        moved = filt.predict(before, control, key=keys[0])
+        after, info = filt.update(moved, measurement, valid_here & here, key=keys[1])
+        if active is not None:
+            after = jax.tree.map(lambda new, old: jnp.where(here, new, old), after, before)
+        return after, History(keep(after), info)
+
+    return lax.scan(advance, state, (controls, measurements, valid, there))

@@ -1,0 +1,93 @@
+"""Rotations of the plane."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxloc.poses.lie_group import Group, as_floats, matmul
+
+
+class SO2(Group):
+    """A planar rotation, kept as cosine and sine of its counter-clockwise angle.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> quarter = jl.poses.SO2.from_angle(jnp.pi / 2)
+        >>> quarter.apply(jnp.array([[1.0, 0.0]])).round(3).tolist()
+        [[-0.0, 1.0]]
+    """
+
+    cos: Float[Array, ""]
+    sin: Float[Array, ""]
+
+    dof: ClassVar[int] = 1
+    labels: ClassVar[tuple[str, ...]] = ("rotation",)
+
+    @staticmethod
+    def from_angle(angle: Any) -> "SO2":
+        """Rotation by an angle in rad."""
+        (angle,) = as_floats(angle)
+        return SO2(jnp.cos(angle), jnp.sin(angle))
+
+    @staticmethod
+    def identity(dtype: Any = float) -> "SO2":
+        """The rotation that does nothing."""
+        return SO2(jnp.ones((), dtype), jnp.zeros((), dtype))
+
+    @staticmethod
+    def exp(xi: Float[Array, "1"]) -> "SO2":
+        """Rotation of a tangent (rad)."""
+        return SO2.from_angle(xi[0])
+
+    @staticmethod
+    def left_jacobian(xi: Float[Array, "1"]) -> Float[Array, "1 1"]:
+        """Planar rotations commute: one."""
+        return jnp.ones((1, 1), xi.dtype)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes of a stack."""
+        return self.cos.shape
+
+    def angle(self) -> Float[Array, ""]:
+        """Angle in (-pi, pi]."""
+        return jnp.arctan2(self.sin, self.cos)
+
+    def log(self) -> Float[Array, "1"]:
+        """Angle as a tangent."""
+        return self.angle()[None]
+
+    def compose(self, other: "SO2") -> "SO2":
+        """Rotation by both angles."""
+        return SO2(self.cos * other.cos - self.sin * other.sin, self.sin * other.cos + self.cos * other.sin)
+
+    def retract(self, delta: Float[Array, "1"]) -> "SO2":
+        """Rotation turned by delta."""
+        return self.compose(SO2.exp(delta))
+
+    def inverse(self) -> "SO2":
+        """Rotation by the opposite angle."""
+        return SO2(self.cos, -self.sin)
+
+    def matrix(self) -> Float[Array, "2 2"]:
+        """Rotation matrix."""
+        return jnp.stack([jnp.stack([self.cos, -self.sin]), jnp.stack([self.sin, self.cos])])
+
+    def adjoint(self) -> Float[Array, "1 1"]:
+        """One: planar rotations commute."""
+        return jnp.ones((1, 1), self.cos.dtype)
+
+    def apply(self, points: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
+        """Rotated points."""
+        return matmul(points, self.matrix().T)
+
+    def normalize(self) -> "SO2":
+        """The nearest rotation, after rounding has crept in."""
+        scale = 1.0 / jnp.sqrt(self.cos**2 + self.sin**2)
+        return SO2(self.cos * scale, self.sin * scale)
+
+
+def wrap_angle(angle: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Angles brought to [-pi, pi), rad; the derivative is one."""
+    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi

@@ -1,0 +1,214 @@
+"""The filter itself: a reading draws poses, corrects maps and multiplies weights; at times particles are drawn anew."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from jaxloc.beliefs import Gaussian, Motion, Particles, resampling
+from jaxloc.filters.interface import Filter, Info
+from jaxloc.poses import SE2
+from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.sensors.landmarks import RangeBearing, sanitize
+from jaxloc.slam.fast_slam.association import Candidates
+from jaxloc.slam.fast_slam.landmark_filter import LandmarkFilter, Landmarks
+from jaxloc.slam.fast_slam.proposals import FromReading, Look, Particle, PathProposal
+from jaxloc.slam.fast_slam.state import FastSlamState
+
+
+class FastSlamInfo(Info):
+    """What an update of `FastSlam` says.
+
+    Attributes:
+        log_likelihood: of the reading given all earlier ones.
+        ok: False when no particle explains the reading; the weights are then kept.
+        ess: effective number of particles before resampling.
+        resampled: whether new particles were drawn.
+        ancestors: which particle each came from: `trace_back` makes paths of them [R-18].
+        landmark: the row of its map that each particle changed, before resampling; -1 where it refused the reading or
+            had no room.
+    """
+
+    log_likelihood: Float[Array, ""]
+    ok: Bool[Array, ""]
+    ess: Float[Array, ""]
+    resampled: Bool[Array, ""]
+    ancestors: Int[Array, " n"]
+    landmark: Int[Array, " n"]
+
+
+class FastSlam(Filter):
+    """Localization and mapping with range and bearing of landmarks, by Rao-Blackwellized particles.
+
+    A reading with a landmark's number updates that row of each particle's map; with -1 each particle takes it for the
+    landmark that explains it best within the gate, or for a new one. A reading outside the gate of a known landmark
+    costs the particle the density at the gate and changes nothing else, so that a false identity does not
+    destroy a good path; a landmark that is contradicted more often than confirmed is measured anew.
+
+    Attributes:
+        motion: of the robot.
+        deviations: standard deviations of range (m) and bearing (rad).
+        mount: T_robot_sensor.
+        proposal: `FromMotion`, `FromReading` or `FromBlock`.
+        num_particles: how many.
+        capacity: rows of a map.
+        ess_threshold: fraction of the particles below which the effective number triggers resampling.
+    """
+
+    motion: Motion
+    deviations: Float[Array, "2"]
+    mount: SE2
+    proposal: PathProposal
+    num_particles: int = eqx.field(static=True)
+    capacity: int = eqx.field(static=True)
+    ess_threshold: float = eqx.field(static=True)
+
+    def __init__(
+        self,
+        motion: Motion,
+        range_deviation: Any,
+        bearing_deviation: Any,
+        *,
+        num_particles: int,
+        capacity: int,
+        proposal: PathProposal = FromReading(),
+        mount: Any = None,
+        ess_threshold: float = 0.5,
+    ):
+        self.motion = motion
+        self.deviations = jnp.stack(as_floats(range_deviation, bearing_deviation))
+        self.mount = SE2.identity(self.deviations.dtype) if mount is None else mount
+        self.proposal, self.num_particles, self.capacity = proposal, num_particles, capacity
+        self.ess_threshold = ess_threshold
+
+    @property
+    def landmark_filter(self) -> LandmarkFilter:
+        """That of each row of a map."""
+        return LandmarkFilter(self.deviations, self.mount)
+
+    def init(self, prior: Gaussian) -> FastSlamState:
+        """Particles at the mean of a density of the pose; its spread is drawn with the first reading."""
+        n, dtype, size = self.num_particles, prior.covariance.dtype, self.proposal.num_pending(self.capacity)
+        pending = jnp.zeros((size, size), dtype).at[:3, :3].set(prior.covariance)
+        one = (prior.mean, pending, Landmarks.empty(self.capacity, dtype))
+        poses, pending, maps = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), one)
+        weights = jnp.full(n, -math.log(n), dtype)
+        return FastSlamState(poses, pending, maps, weights, jnp.zeros((), jnp.int32))
+
+    @eqx.filter_jit
+    def predict(self, state: FastSlamState, control: Any, *, key: Key[Array, ""] | None = None) -> FastSlamState:
+        """Every particle moves; its noise stays pending until a reading can say something about it.
+
+        Raises:
+            ValueError: without a key, where the proposal draws between readings.
+        """
+        particles = jax.vmap(Particle)(state.poses, state.pending, state.maps)
+        due = self.proposal.draws_now(state.step)
+        if due is not None:
+            if key is None:
+                raise ValueError("FastSlam.predict draws poses: pass key=jax.random.key(...), as to run(..., key=key).")
+            normal = jax.random.normal(key, state.pending.shape[:2], state.pending.dtype)
+            particles = lax.cond(due, lambda: jax.vmap(self.proposal.draw)(particles, normal), lambda: particles)
+
+        def move(pose, pending):
+            moved, jacobian = self.motion.linearize(pose, control)
+            pending = pending.at[:3].set(matmul(jacobian, pending[:3]))
+            pending = pending.at[:, :3].set(matmul(pending[:, :3], jacobian.T))
+            return moved, pending.at[:3, :3].add(self.motion.covariance(pose, control))
+
+        poses, pending = jax.vmap(move)(particles.pose, particles.pending)
+        return FastSlamState(poses, pending, particles.known, state.log_weights, state.step + 1)
+
+    @eqx.filter_jit
+    def update(
+        self,
+        state: FastSlamState,
+        measurement: RangeBearing,
+        valid: Bool[Array, ""],
+        *,
+        key: Key[Array, ""] | None = None,
+    ) -> tuple[FastSlamState, FastSlamInfo]:
+        """One reading: poses are drawn, landmarks corrected or added, weights multiplied, and particles resampled.
+
+        Raises:
+            ValueError: without a key.
+        """
+        candidates = Candidates.anything(self.capacity, state.pending.dtype)
+        return self.update_among(state, measurement, valid, candidates, key=key)
+
+    def update_among(
+        self,
+        state: FastSlamState,
+        measurement: RangeBearing,
+        valid: Bool[Array, ""],
+        candidates: Candidates,
+        *,
+        key: Key[Array, ""] | None = None,
+    ) -> tuple[FastSlamState, FastSlamInfo]:
+        """`update` by a reading of which is known what it looks like.
+
+        Raises:
+            ValueError: without a key.
+        """
+        if key is None:
+            raise ValueError("FastSlam.update draws particles: pass key=jax.random.key(...), as to run(..., key=key).")
+        key_draw, key_resample = jax.random.split(key)
+        reading, usable = sanitize(measurement, valid & (measurement.landmark < self.capacity))
+        normal = jax.random.normal(key_draw, state.pending.shape[:2], state.pending.dtype)
+        before, look = jax.vmap(Particle)(state.poses, state.pending, state.maps), Look(reading, candidates)
+        explain = jax.vmap(self.proposal.explain, in_axes=(None, 0, None, 0))
+        found = explain(self.landmark_filter, before, look, normal)
+        joint = state.log_weights + found.log_density
+        total = logsumexp(joint)
+        fine = usable & jnp.isfinite(total)
+        weights = jnp.where(fine, joint - jnp.where(fine, total, 0.0), state.log_weights)
+        ess = Particles(state.poses, weights).ess
+        resampled = fine & (ess < self.ess_threshold * self.num_particles)
+        own = jnp.arange(self.num_particles, dtype=jnp.int32)
+        drawn = resampling.systematic(key_resample, weights, self.num_particles).astype(jnp.int32)
+        ancestors = jnp.where(resampled, drawn, own)
+        weights = jnp.where(resampled, jnp.full_like(weights, -math.log(self.num_particles)), weights)
+        after = jax.tree.map(lambda new, old: jnp.where(fine, new[ancestors], old), found.particle, before)
+        info = FastSlamInfo(
+            log_likelihood=jnp.where(fine, total, 0.0),
+            ok=fine | ~usable,
+            ess=ess,
+            resampled=resampled,
+            ancestors=ancestors,
+            landmark=jnp.where(fine, found.row, -1),
+        )
+        return FastSlamState(after.pose, after.pending, after.known, weights, state.step), info
+
+
+@eqx.filter_jit
+def trace_back(poses: SE2, ancestors: Int[Array, "t n"], particle: Int[Array, ""]) -> SE2:
+    """The path of one of the last particles, from the poses and ancestors of each update [R-18].
+
+    Args:
+        poses: of all particles after each update, stacked along steps and particles. With `FromBlock` they are means,
+            for the path within a block is not drawn.
+        ancestors: `FastSlamInfo.ancestors` of each update.
+        particle: index among the last particles.
+
+    Returns:
+        Poses stacked along the steps.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxloc as jl
+        >>> x = jnp.array([[0.0, 1.0], [10.0, 11.0]])
+        >>> poses = jax.vmap(jax.vmap(lambda x: jl.poses.SE2(x, 0.0, 0.0)))(x)
+        >>> ancestors = jnp.array([[0, 1], [1, 1]])
+        >>> jl.slam.fast_slam.trace_back(poses, ancestors, jnp.array(0)).translation[:, 0].tolist()
+        [1.0, 10.0]
+    """
+
+    def back(current, inputs):
+        here, parents = inputs
+        return parents[current], jax.tree.map(lambda leaf: leaf[current], here)
+
+    return lax.scan(back, particle.astype(ancestors.dtype), (poses, ancestors), reverse=True)[1]

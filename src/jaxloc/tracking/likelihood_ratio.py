@@ -1,0 +1,203 @@
+"""A scan beside the tracks: how much more each measurement speaks of a track than of clutter or of a newborn target."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxloc.beliefs import Gaussian, chi2_quantile
+from jaxloc.filters import GaussianFilter, GaussianState, InteractingFilters
+from jaxloc.filters.kalman import finite_or_zero
+from jaxloc.tracking.gating import Comparison, compare, corrected, count_valid
+from jaxloc.tracking.models.birth import StaticBirth
+from jaxloc.tracking.models.target import TargetModel
+from jaxloc.tracking.tracks import Tracks
+
+_RAREST = -200.0  # log intensity of false measurements where there can be none
+
+
+class Newborn(eqx.Module):
+    """What each measurement would be as the first one of a new target.
+
+    Attributes:
+        states: of the new targets, stacked.
+        log_intensity: of first measurements, with the probability that they are made.
+        expected: number of first measurements in a scan.
+    """
+
+    states: Any
+    log_intensity: Float[Array, " m"]
+    expected: Float[Array, ""]
+
+
+class Scan(eqx.Module):
+    """A padded set of measurements beside predicted tracks.
+
+    The log of the sum over all joint associations is
+
+    ``base + log sum_a prod_i (exp log_odds[i, a_i] or, where i has none, exp log_missed[i])``.
+
+    Attributes:
+        measurements: with finite numbers everywhere.
+        there: which of them there are.
+        comparison: of Gaussian tracks with them; None for tracks with modes.
+        detection: p_D of each track.
+        log_missed: ``log (1 - r p_D)``.
+        log_odds: ``log (r p_D N(z; ...) / (kappa + b))``; minus infinity outside the gate.
+        newborn: the measurements as first ones.
+        share: of newborn targets in the false measurements, ``b / (kappa + b)``.
+        base: log likelihood of the scan if no track were measured.
+    """
+
+    measurements: Any
+    there: Bool[Array, " m"]
+    comparison: Comparison | None
+    detection: Float[Array, " k"]
+    log_missed: Float[Array, " k"]
+    log_odds: Float[Array, "k m"]
+    newborn: Newborn
+    share: Float[Array, " m"]
+    base: Float[Array, ""]
+
+
+def examine(
+    model: TargetModel, tracks: Tracks, measurements: Any, valid: Bool[Array, " m"], gate: float | None
+) -> Scan:
+    """Every predicted track beside every measurement.
+
+    Args:
+        model: the assumptions.
+        tracks: as predicted.
+        measurements: stacked.
+        valid: which of them there are.
+        gate: probability that a track's own measurement passes; None for no gate.
+    """
+    there = count_valid(measurements, valid)
+    measurements = finite_or_zero(measurements)
+    likelihood, comparison = _look(model.filter, tracks.states, measurements, there, gate)
+    detection = _detection(model, tracks.means(), tracks.existence)
+    newborn = begin(model, tracks, measurements, there)
+    clutter = jax.vmap(model.clutter.log_intensity)(measurements)
+    false = jnp.maximum(jnp.logaddexp(clutter, newborn.log_intensity), _RAREST)
+    seen = tracks.existence * detection
+    inside = jnp.isfinite(likelihood) & (seen > 0.0)[:, None]
+    log_seen = jnp.log(jnp.where(seen > 0.0, seen, 1.0))
+    odds = log_seen[:, None] + jnp.where(inside, likelihood, 0.0) - false[None, :]
+    # A certain target that is surely measured may still be missed, by rounding: no division by zero.
+    missed = jnp.log(jnp.maximum(1.0 - seen, float(jnp.finfo(seen.dtype).eps)))
+    share = jnp.where(there, jnp.exp(jnp.minimum(newborn.log_intensity - false, 0.0)), 0.0)
+    base = jnp.sum(jnp.where(there, false, 0.0)) - model.clutter.rate - newborn.expected
+    return Scan(
+        measurements, there, comparison, detection, missed, jnp.where(inside, odds, -jnp.inf), newborn, share, base
+    )
+
+
+def begin(model: TargetModel, tracks: Tracks, measurements: Any, there: Bool[Array, " m"]) -> Newborn:
+    """The targets that measurements would be the first of.
+
+    Where births are a mixture, the component that explains a measurement best is corrected by it.
+    """
+    num = there.shape[0]
+    first = jax.tree.map(lambda leaf: leaf[0], measurements)
+    if isinstance(model.birth, StaticBirth):
+        return _from_mixture(model, measurements, there)
+    if model.birth.log_intensity(first) is None:
+        states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[0], (num, *leaf.shape[1:])), tracks.states)
+        nothing = jnp.zeros((), tracks.existence.dtype)
+        return Newborn(states, jnp.full((num,), -jnp.inf, nothing.dtype), nothing)
+    intensity = jax.vmap(model.birth.log_intensity)(measurements)
+    states = jax.vmap(lambda z: model.filter.init(model.birth.seed(z)))(measurements)
+    return Newborn(states, jnp.where(there, intensity, -jnp.inf), model.birth.rate)
+
+
+def _from_mixture(model: TargetModel, measurements: Any, there: Bool[Array, " m"]) -> Newborn:
+    mixture = model.birth.intensity
+    states = jax.vmap(lambda mean, covariance: model.filter.init(Gaussian(mean, covariance)))(
+        mixture.means, mixture.covariances
+    )
+    likelihood, comparison = _look(model.filter, states, measurements, there, None)
+    expected = mixture.weights * _detection(model, mixture.means, mixture.weights)
+    possible = jnp.isfinite(likelihood) & (expected > 0.0)[:, None]
+    scale = jnp.log(jnp.where(expected > 0.0, expected, 1.0))
+    terms = jnp.where(possible, scale[:, None] + jnp.where(possible, likelihood, 0.0), -1e30)
+    intensity = jnp.where(jnp.any(possible, axis=0), logsumexp(terms, axis=0), -jnp.inf)
+    best = jnp.argmax(terms, axis=0)
+    scan = _correct(model.filter, states, comparison, measurements, there, best, jnp.arange(there.shape[0]))
+    return Newborn(scan, intensity, jnp.sum(expected))
+
+
+def correct_tracks(
+    model: TargetModel, tracks: Tracks, scan: Scan, rows: Int[Array, " n"], columns: Int[Array, " n"]
+) -> Any:
+    """The states of some tracks given a measurement each.
+
+    Args:
+        model: the assumptions.
+        tracks: as they were examined.
+        scan: what `examine` found.
+        rows: places of the tracks.
+        columns: places of the measurements.
+    """
+    return _correct(model.filter, tracks.states, scan.comparison, scan.measurements, scan.there, rows, columns)
+
+
+def whole(state: Any, likelihood: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether all numbers of a state and its likelihood are finite."""
+    leaves = [leaf for leaf in jax.tree.leaves((state, likelihood)) if eqx.is_inexact_array(leaf)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(lax.stop_gradient(leaf))) for leaf in leaves]))
+
+
+def _detection(model: TargetModel, means: Any, like: Float[Array, " k"]) -> Float[Array, " k"]:
+    return jax.vmap(model.detection.probability)(means).astype(like.dtype)
+
+
+def _look(
+    filt: Any, states: Any, measurements: Any, there: Bool[Array, " m"], gate: float | None
+) -> tuple[Float[Array, "k m"], Comparison | None]:
+    if isinstance(filt, GaussianFilter):
+        comparison = compare(filt, states.mean, states.covariance_sqrt, measurements, there, gate)
+        return comparison.log_likelihood, comparison
+    if not isinstance(filt, InteractingFilters):
+        raise TypeError(
+            f"Trackers need a filter of the Kalman family or InteractingFilters; got {type(filt).__name__}."
+        )
+
+    def pair(state, z, here):
+        _, info = filt.update(state, z, here)
+        return info.log_likelihood, jnp.min(info.modes.nis), info.modes.innovation
+
+    each = jax.vmap(lambda state: jax.vmap(lambda z, here: pair(state, z, here))(measurements, there))
+    likelihood, nis, innovations = each(states)
+    inside = jnp.broadcast_to(there[None, :], nis.shape)
+    if gate is not None:
+        with jax.ensure_compile_time_eval():
+            bound = float(chi2_quantile(gate, float(innovations.shape[-1])))
+        inside = inside & (nis <= bound)
+    return jnp.where(inside, likelihood, -jnp.inf), None
+
+
+def _correct(
+    filt: Any,
+    states: Any,
+    comparison: Comparison | None,
+    measurements: Any,
+    there: Bool[Array, " m"],
+    rows: Int[Array, " n"],
+    columns: Int[Array, " n"],
+) -> Any:
+    if comparison is not None:
+
+        def given(i, j):
+            return GaussianState(*corrected(states.mean, comparison, i, j), states.step[i])
+
+        return jax.vmap(given)(rows, columns)
+
+    def one(i, j):
+        state, z = jax.tree.map(lambda leaf: leaf[i], states), jax.tree.map(lambda leaf: leaf[j], measurements)
+        return filt.update(state, z, there[j])[0]
+
+    return jax.vmap(one)(rows, columns)

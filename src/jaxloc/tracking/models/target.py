@@ -1,0 +1,102 @@
+"""What targets do, and what a sensor sees of them: shared by all trackers."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxloc.filters import Filter
+from jaxloc.poses import SE3
+from jaxloc.poses.lie_group import as_floats
+from jaxloc.sensors import Pinhole
+from jaxloc.tracking.models.birth import Birth
+from jaxloc.tracking.models.clutter import Clutter
+
+
+class Detection(eqx.Module):
+    """How probable it is that a target is measured in a scan."""
+
+    @abstractmethod
+    def probability(self, state: Any) -> Float[Array, ""]:
+        """At a state."""
+
+
+class ConstantDetection(Detection):
+    """The same everywhere.
+
+    Args:
+        value: p_D.
+    """
+
+    value: Float[Array, ""]
+
+    def __init__(self, value: Any):
+        (self.value,) = as_floats(value)
+
+    def probability(self, state: Any) -> Float[Array, ""]:
+        """p_D."""
+        del state
+        return self.value
+
+
+class FieldOfView(Detection):
+    """One probability in the view of a camera, none outside it. States begin with a position in the world.
+
+    Args:
+        value: p_D in view.
+        camera: whose view it is.
+        pose: ``T_world_camera``.
+        size: (width, height) of the image, px.
+        farthest: depth up to which things are seen, m.
+        nearest: depth from which on they are, m.
+    """
+
+    value: Float[Array, ""]
+    camera: Pinhole
+    pose: SE3
+    size: Float[Array, "2"]
+    farthest: Float[Array, ""]
+    nearest: Float[Array, ""]
+
+    def __init__(self, value: Any, camera: Pinhole, pose: SE3, size: Any, *, farthest: Any, nearest: Any = 2.0):
+        self.value, self.farthest, self.nearest = as_floats(value, farthest, nearest)
+        self.size = jnp.stack(as_floats(*size))
+        self.camera, self.pose = camera, pose
+
+    def probability(self, state: Float[Array, " d"]) -> Float[Array, ""]:
+        """p_D in view, else zero."""
+        place = self.pose.inverse().apply(state[None, :3])
+        ahead = (place[0, 2] > self.nearest) & (place[0, 2] < self.farthest)
+        uv = self.camera.project(jnp.where(ahead, place, jnp.array([[0.0, 0.0, 1.0]], place.dtype)))[0]
+        seen = ahead & jnp.all((uv >= 0.0) & (uv < self.size))
+        return jnp.where(seen, self.value, 0.0)
+
+
+class TargetModel(eqx.Module):
+    """The assumptions of the standard multi-target model: independent targets, each measured at most once in a scan.
+
+    Args:
+        filter: how one target moves and is measured, and how these are linearized: a `KalmanFilter` for linear models,
+            an `ExtendedKalmanFilter` (one iteration) or a `SigmaPointFilter`. Its own gate is not used. Some trackers
+            take `InteractingFilters` as well.
+        detection: p_D, a number or a `Detection`.
+        survival: p_S, probability that a target is still there at the next scan.
+        clutter: what is measured of no target.
+        birth: where targets appear.
+
+    References:
+        Mahler, "Multitarget Bayes filtering via first-order multitarget moments", IEEE TAES 2003 [T-62], [T-74].
+    """
+
+    filter: Filter
+    detection: Detection
+    survival: Float[Array, ""]
+    clutter: Clutter
+    birth: Birth
+
+    def __init__(self, filter: Filter, *, detection: Any, survival: Any, clutter: Clutter, birth: Birth):
+        self.filter, self.clutter, self.birth = filter, clutter, birth
+        self.detection = detection if isinstance(detection, Detection) else ConstantDetection(detection)
+        (self.survival,) = as_floats(survival)
