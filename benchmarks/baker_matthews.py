@@ -37,7 +37,7 @@ class Scene(NamedTuple):
     """An image with the place of its template.
 
     Attributes:
-        image: grey levels.
+        image: gray levels.
         corner: (column, row) of the template's first pixel.
         size: (columns, rows) of the template.
     """
@@ -105,7 +105,7 @@ class Trial(eqx.Module):
 
 
 def steps(number: int, **choices: object) -> lk.LucasKanade:
-    """The paper's settings: grey levels unchanged, full size, a fixed number of steps."""
+    """The paper's settings: gray levels unchanged, full size, a fixed number of steps."""
     settled = {"brightness": lk.Unchanged(), "scales": lk.FullSize(), "max_steps": number, "tolerance": 0.0}
     return lk.LucasKanade(**{**settled, **choices})
 

@@ -173,7 +173,7 @@ def _seeds(repeats: int) -> Iterator[Metric]:
 
 
 def _covariance(count: int) -> Iterator[Metric]:
-    """NEES of a homography over seeds of noise on both pictures."""
+    """NEES of a homography over seeds of noise on both images."""
     rng, picture = np.random.default_rng(3), _picture()
     corners, template = _moved(rng, 2)
     truth = Homography.from_matrix(

@@ -1,4 +1,4 @@
-"""Template search, phase correlation and mutual information beside OpenCV, on real pictures."""
+"""Template search, phase correlation and mutual information beside OpenCV, on real images."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -56,7 +56,7 @@ def _search(scene: np.ndarray, repeats: int) -> Iterator[Metric]:
 
 
 def _phase(scenes: list[np.ndarray], repeats: int) -> Iterator[Metric]:
-    """Shifts of 256x256 pictures."""
+    """Shifts of 256x256 images."""
     rng, errors, peers, window = np.random.default_rng(3), [], [], cv2.createHanningWindow((256, 256), cv2.CV_64F)
     for scene in scenes:
         for shift in rng.uniform(-20, 20, (4, 2)):
@@ -82,7 +82,7 @@ def _corner_error(found: np.ndarray, truth: np.ndarray, shape: tuple[int, int]) 
 
 
 def _similarity(scenes: list[np.ndarray], count: int, repeats: int) -> Iterator[Metric]:
-    """Any rotation, scales of 0.7 to 1.4, shifts up to 15 px, of 256x256 pictures."""
+    """Any rotation, scales of 0.7 to 1.4, shifts up to 15 px, of 256x256 images."""
     rng, errors, oks, center = np.random.default_rng(4), [], [], np.array([127.5, 127.5])
     for scene in scenes:
         for _ in range(count):
@@ -111,7 +111,7 @@ def _similarity(scenes: list[np.ndarray], count: int, repeats: int) -> Iterator[
 
 
 def _information(scenes: list[np.ndarray], repeats: int) -> Iterator[Metric]:
-    """Affine warps, starts 5 px off, grey levels inverted, bent by gamma 2.2, or both, noise 2; ECC beside it."""
+    """Affine warps, starts 5 px off, gray levels inverted, bent by gamma 2.2, or both, noise 2; ECC beside it."""
     rng, shape = np.random.default_rng(5), (100, 110)
     errors: dict[str, list[float]] = {key: [] for kind in _MAPS for key in (kind, f"{kind}.ecc")}
     for scene in scenes:

@@ -188,7 +188,7 @@ def _consistency(squared: np.ndarray) -> Iterator[Metric]:
 
 
 def _mot(folder: Path) -> Iterator[Metric]:
-    """Pedestrians in pictures, by overlap of boxes."""
+    """Pedestrians in images, by overlap of boxes."""
     pipeline = jl.pipelines.detection_tracking
     truth = jl.data.tracking.read_mot_tracks(folder / "gt.txt")
     found = jl.data.tracking.read_mot_detections(folder / "det.txt", num_frames=len(truth.detections))

@@ -30,14 +30,14 @@ CAPACITY, NEAR, RATIO_OF_TWO, GRID = 1000, 2.5, 0.8, (6, 8)
 
 
 class Feature(NamedTuple):
-    """A detector with its descriptor, from a picture of bytes to keypoints and descriptors."""
+    """A detector with its descriptor, from an image of bytes to keypoints and descriptors."""
 
     run: Callable[[np.ndarray], tuple[Keypoints, Descriptors]]
     bits: float
 
 
 class Pair(NamedTuple):
-    """Two pictures, and the homography from the first to the second."""
+    """Two images, and the homography from the first to the second."""
 
     first: np.ndarray
     second: np.ndarray
@@ -113,7 +113,7 @@ def _warped(image: np.ndarray, homography: np.ndarray) -> Pair:
 
 
 def pairs(smoke: bool) -> dict[str, list[Pair]]:
-    """Pictures turned, scaled and seen from the side, and two real views of a wall."""
+    """Images turned, scaled and seen from the side, and two real views of a wall."""
     image = picture("astronaut", smoke)
     height, width = image.shape
     center = 0.5 * np.array([width - 1.0, height - 1.0])
@@ -151,7 +151,7 @@ def _mapped(homography: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def compared(first: tuple, second: tuple, pair: Pair, gate: jax.Array | None = None) -> dict[str, float]:
-    """Repeatability, and precision and recall of matches, among keypoints that both pictures show."""
+    """Repeatability, and precision and recall of matches, among keypoints that both images show."""
     uv = [np.asarray(side[0].uv) for side in (first, second)]
     valid = [np.asarray(side[0].valid) for side in (first, second)]
     height, width = pair.second.shape
@@ -181,7 +181,7 @@ def _feature(name: str, feature: Feature, groups: dict[str, list[Pair]], repeats
     yield Metric(f"{key}.keypoints", float(known[id(image)][0].valid.sum()), "points", "equal", ACCURACY)
     yield Metric(f"{key}.bits", feature.bits, "bits a descriptor", "lower", ACCURACY)
     took = quickest(lambda: feature.run(image)[1].values, repeats)
-    yield Metric(f"{key}.time", 1e3 * took.wall, "ms a picture", "lower", TIME)
+    yield Metric(f"{key}.time", 1e3 * took.wall, "ms an image", "lower", TIME)
     for group, members in groups.items():
         figures = []
         for pair in members:

@@ -1,4 +1,4 @@
-"""Poses from features of every kind beside SciPy, pallets in pictures, and the camera's motion from flow."""
+"""Poses from features of every kind beside SciPy, pallets in images, and the camera's motion from flow."""
 
 from collections.abc import Iterator
 
@@ -124,7 +124,7 @@ def _scipy(host: dict[str, list[np.ndarray]], index: int) -> object:
 
 
 def _pallet(count: int, repeats: int) -> Iterator[Metric]:
-    """Error of poses of pallets in pictures, kinds told, and time a picture of 640 x 480."""
+    """Error of poses of pallets in images, kinds told, and time an image of 640 x 480."""
     camera, kinds = make_camera(height=0.35), (euro_long(), euro_short(), block_narrow())
     detect = eqx.filter_jit(lambda image: detect_pallet(image, camera, kinds))
     for x in (2.0,) if count < 4 else (1.2, 2.0, 3.0, 4.0):

@@ -38,7 +38,7 @@ def metrics(smoke: bool) -> Iterator[Metric]:
 
 
 def _moved(image: np.ndarray, gain: float, bias: float, noise: float, rng: np.random.Generator) -> Pair:
-    """A picture and the same turned, stretched and moved by about five pixels, otherwise exposed."""
+    """An image and the same turned, stretched and moved by about five pixels, otherwise exposed."""
     center = np.array(image.shape[::-1]) / 2
     linear = np.array([[1.006, -0.008], [0.009, 0.996]])
     matrix = np.c_[linear, np.array([2.6, -1.8]) + center - linear @ center]
@@ -77,7 +77,7 @@ def _peer(pair: Pair, uv: np.ndarray) -> np.ndarray:
 
 
 def _exposure(names: tuple[str, ...]) -> Iterator[Metric]:
-    """The worst of all pictures and exposures: wrong by more than a pixel, and how precise the rest."""
+    """The worst of all images and exposures: wrong by more than a pixel, and how precise the rest."""
     import skimage.data
 
     folder, rng, rows = Path(skimage.data.__file__).parent, np.random.default_rng(0), []

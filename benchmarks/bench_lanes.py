@@ -1,4 +1,4 @@
-"""Lanes by RALPH: accuracy on synthetic roads, templates that must follow the road, time by picture and by batch.
+"""Lanes by RALPH: accuracy on synthetic roads, templates that must follow the road, time by image and by batch.
 
 There is no public implementation to compare with; figures of accuracy stand against the truth of the renderer.
 """
@@ -25,7 +25,7 @@ SPEED, SHAPE = 20.0, (480, 640)
 
 
 class Errors(NamedTuple):
-    """Of many pictures: offset (m), heading (rad), curvature (1/m), pitch (rad); squared Mahalanobis distance; ok."""
+    """Of many images: offset (m), heading (rad), curvature (1/m), pitch (rad); squared Mahalanobis distance; ok."""
 
     values: np.ndarray
     nees: np.ndarray
@@ -46,13 +46,13 @@ def metrics(smoke: bool) -> Iterator[Metric]:
 
 
 def view_of(picture: np.ndarray, wrong_pitch: float = 0.0) -> GroundView:
-    """A picture from above, by a camera whose pitch may be known wrongly."""
+    """An image from above, by a camera whose pitch may be known wrongly."""
     ground = eqx.tree_at(lambda g: g.pitch, GROUND, GROUND.pitch - wrong_pitch)
     return look(ground, jnp.asarray(picture), GroundGrid.for_speed(SPEED))
 
 
 def template_of(road: Road, pictures: int = 8) -> ralph.Template:
-    """What a driver saves who keeps to the middle of a straight lane for a while: the mean of some pictures."""
+    """What a driver saves who keeps to the middle of a straight lane for a while: the mean of some images."""
     template, straight = None, jl.lanes.Lane(0.0, 0.0, 0.0)
     for index in range(pictures):
         view = view_of(render(road, straight, GROUND, travelled=5.0 + 37.0 * index))
@@ -62,7 +62,7 @@ def template_of(road: Road, pictures: int = 8) -> ralph.Template:
 
 
 def trials(road: Road, wrong_pitch: float, count: int) -> Errors:
-    """Pictures of several stretches of a road, and roads, from random places in the lane."""
+    """Images of several stretches of a road, and roads, from random places in the lane."""
     rng, errors, nees, ok = np.random.default_rng(11), [], [], []
     for index in range(count):
         here = dataclasses.replace(road, seed=index // 10)
@@ -147,9 +147,9 @@ def _adaptation(frames: int) -> Iterator[Metric]:
 
 
 def follow(trip: RoadDrive, views: list[GroundView], adaptation: ralph.Adaptation) -> tuple[np.ndarray, np.ndarray]:
-    """How far the offset is off at each picture of a drive, and whether the lane was believed.
+    """How far the offset is off at each image of a drive, and whether the lane was believed.
 
-    The vehicle's odometry carries the lane from picture to picture, also where the road looks like nothing known.
+    The vehicle's odometry carries the lane from image to image, also where the road looks like nothing known.
     """
     fit, errors, believed = ralph.LaneFit(*trip.lanes[0, :3]), [], []
     template = ralph.capture(views[0], fit)

@@ -1,4 +1,4 @@
-"""Floor mosaics: accuracy of a loop of distorted pictures, tracking, and the update rate, beside OpenCV."""
+"""Floor mosaics: accuracy of a loop of distorted images, tracking, and the update rate, beside OpenCV."""
 
 from collections.abc import Iterator
 
@@ -42,11 +42,11 @@ def _loop(drive: floor.FloorDrive, built: floor_mosaic.FloorMosaic, pixel: float
     yield Metric("mosaic.loop.odometry", 100.0 * reckoned / way, "% of path")
     yield Metric("mosaic.loop.before", 100.0 * before / way, "% of path", "lower", 0.5)
     yield Metric("mosaic.loop.after", after.max() / pixel, "px", "lower", 0.5)
-    yield Metric("mosaic.left_out", len(built.left_out), "pictures", "lower", ACCURACY)
+    yield Metric("mosaic.left_out", len(built.left_out), "images", "lower", ACCURACY)
 
 
 def _pairs(drive: floor.FloorDrive, built: floor_mosaic.FloorMosaic, pixel: float, count: int) -> Iterator[Metric]:
-    """Picture to picture, beside OpenCV's ECC and phase correlation on the same rectified patches."""
+    """Image to image, beside OpenCV's ECC and phase correlation on the same rectified patches."""
     rectifier = built.view.rectifier()
     ours, ecc, phase = [], [], []
     for number in range(count):

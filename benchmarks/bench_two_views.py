@@ -21,7 +21,7 @@ KINDS = ("planar", "rotation", "repeated", "collinear", "empty")
 
 
 class View(NamedTuple):
-    """Two pictures of random points: pixels about the center, rotation and direction of ``T_first_second``."""
+    """Two images of random points: pixels about the center, rotation and direction of ``T_first_second``."""
 
     first: np.ndarray
     second: np.ndarray

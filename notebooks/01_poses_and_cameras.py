@@ -114,7 +114,7 @@ plt.show()
 # ## Cameras
 #
 # A pinhole camera with a lens: pixels are (right, down) with centers at integers. Its intrinsics are array
-# leaves, so that they can be learned. A point behind the camera has no picture: `project` returns something
+# leaves, so that they can be learned. A point behind the camera has no image: `project` returns something
 # finite for it, with zero gradient, and `in_front` says so. That is the rule of the whole library: no NaN,
 # and a mask beside the values.
 

@@ -111,4 +111,4 @@ for depth, sigma in zip(depths, sigmas, strict=True):
 #
 # ## Next steps
 #
-# `jaxloc track SEQUENCE` does all this on a recording, and writes tracks, pictures and a report.
+# `jaxloc track SEQUENCE` does all this on a recording, and writes tracks, images and a report.

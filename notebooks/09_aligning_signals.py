@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 9. Aligning signals
 #
-# There are two ways from pictures to a pose: match signals, or match features. This notebook takes the first: a
-# template is laid upon an image until their grey levels agree. Lucas and Kanade did it with derivatives in 1981; Baker
+# There are two ways from images to a pose: match signals, or match features. This notebook takes the first: a
+# template is laid upon an image until their gray levels agree. Lucas and Kanade did it with derivatives in 1981; Baker
 # and Matthews sorted all the ways to do so in 2004, and measured them. We repeat their experiment, and go on from it.
 
 # %%
@@ -31,7 +31,7 @@ plt.rcParams["figure.dpi"] = 70
 #
 # A template of 100 x 100 pixels is cut from an image under a random affine warp: three points are moved by noise of
 # sigma pixels. The search starts at the unmoved place. It has converged when its points end within one pixel. The
-# authors' image and random numbers are used where they are at hand, else a picture made of noise.
+# authors' image and random numbers are used where they are at hand, else an image made of noise.
 
 
 # %%
@@ -47,7 +47,7 @@ if protocol.RECORDINGS.is_dir():
     scene, offsets, name = protocol.recorded("takeo"), protocol.offsets(count, 3), "Takeo, the authors' image"
 else:
     scene = protocol.Scene(made_of_noise(), (30, 70), (100, 100))
-    offsets, name = np.float32(np.random.default_rng(1).normal(size=(count, 3, 2))), "a picture made of noise"
+    offsets, name = np.float32(np.random.default_rng(1).normal(size=(count, 3, 2))), "an image made of noise"
 
 sigmas = (2, 6, 10) if FAST else (1, 2, 4, 6, 8, 10)
 curves = {
@@ -106,7 +106,7 @@ for label, brightness in {"unchanged": lk.Unchanged(), "gain and bias": lk.GainB
 # %% [markdown]
 # ## From anywhere
 #
-# Many starts are cheap on a small picture: 49 of them are aligned at the coarsest level, in one batch, and the best
+# Many starts are cheap on a small image: 49 of them are aligned at the coarsest level, in one batch, and the best
 # four to the end.
 
 # %%
@@ -125,9 +125,9 @@ for label, run in {
     print(f"{label:<22} ok {bool(fit.ok)!s:<5} off by {float(apart.mean()):8.3f} px, {spent:.0f} ms")
 
 # %% [markdown]
-# ## Pictures of another kind
+# ## Images of another kind
 #
-# Where dark has become bright, neither differences nor correlations help. Mutual information only asks that one picture
+# Where dark has become bright, neither differences nor correlations help. Mutual information only asks that one image
 # tells something about the other.
 
 # %%
@@ -141,7 +141,7 @@ for label, align in {"gain and bias": lk.align, "mutual information": mutual_inf
 # %% [markdown]
 # ## Thousands of small templates
 #
-# A tracker aligns a small patch around each of many points. Its gain is held near that of the whole picture: a free
+# A tracker aligns a small patch around each of many points. Its gain is held near that of the whole image: a free
 # gain would let a patch match anything flat.
 
 # %%
@@ -154,7 +154,7 @@ print(f"{float(found.ok.mean()):.0%} tracked, median error {float(jnp.median(off
 # %% [markdown]
 # ## Derivatives
 #
-# The aligned warp has derivatives by every pixel of both pictures: those of the solution, not of the iterations.
+# The aligned warp has derivatives by every pixel of both images: those of the solution, not of the iterations.
 
 
 # %%
@@ -177,7 +177,7 @@ plt.show()
 # - All formulations of Gauss-Newton converge alike; the inverse ones cost least. Scales matter more than either.
 # - Gain and bias belong into the model, not into a step before it.
 # - A batch of coarse starts costs a few fine ones.
-# - The covariance carries the noise of both pictures; it does not know about a warp that is too simple for its scene.
+# - The covariance carries the noise of both images; it does not know about a warp that is too simple for its scene.
 #
 # ## Next steps
 #

@@ -39,9 +39,9 @@ view = look(ground, jnp.asarray(picture), GroundGrid.for_speed(20.0))
 straight = ralph.straighten(view, ralph.LaneFit(0.3, 0.01, 1.5e-3), view.grid.left)
 
 figure, axes = plt.subplots(1, 3, figsize=(11, 3))
-pictures = {"picture": picture, "from above": view.image, "straightened": straight.values}
+pictures = {"image": picture, "from above": view.image, "straightened": straight.values}
 for axis, (title, image) in zip(axes, pictures.items(), strict=True):
-    axis.imshow(image, cmap="gray", aspect="auto", origin="upper" if title == "picture" else "lower")
+    axis.imshow(image, cmap="gray", aspect="auto", origin="upper" if title == "image" else "lower")
     axis.set_title(title), axis.set_axis_off()
 plt.show()
 

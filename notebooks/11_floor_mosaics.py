@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 11. Mosaics of a floor
 #
-# A camera that looks straight down sees texture wherever there is a floor. Laid side by side, its pictures become a
-# map; a later drive is localized in that map to a fraction of a millimeter. The pictures here are synthetic: concrete,
+# A camera that looks straight down sees texture wherever there is a floor. Laid side by side, its images become a
+# map; a later drive is localized in that map to a fraction of a millimeter. The images here are synthetic: concrete,
 # a lens that bends lines, light that falls off to the corners, an exposure that changes, and odometry that drifts.
 
 # %%
@@ -31,8 +31,8 @@ plt.show()
 # %% [markdown]
 # ## Making the map
 #
-# Each picture is laid upon its neighbors by Lucas and Kanade's method, from where odometry says it is; where the path
-# comes back, pictures are laid upon those taken there before. A pose graph makes all of it agree, and pictures are
+# Each image is laid upon its neighbors by Lucas and Kanade's method, from where odometry says it is; where the path
+# comes back, images are laid upon those taken there before. A pose graph makes all of it agree, and images are
 # blended with little weight at their dark corners.
 
 # %%
@@ -47,10 +47,10 @@ def distances(poses):
 
 
 way = np.linalg.norm(np.diff(trip.poses[:, :2], axis=0), axis=1).sum()
-print(f"one pixel is {1e3 * pixel:.2f} mm; the path is {way:.2f} m long; pictures left out: {built.left_out}")
+print(f"one pixel is {1e3 * pixel:.2f} mm; the path is {way:.2f} m long; images left out: {built.left_out}")
 off = [1e3 * error for error in (distances(trip.reckoned())[-1], distances(built.before_closure)[-1])]
-print(f"end of the loop off by: odometry {off[0]:.2f} mm, pictures {off[1]:.4f} mm")
-print(f"worst picture after closing it: {1e3 * distances(built.poses).max():.4f} mm")
+print(f"end of the loop off by: odometry {off[0]:.2f} mm, images {off[1]:.4f} mm")
+print(f"worst image after closing it: {1e3 * distances(built.poses).max():.4f} mm")
 plt.figure(figsize=(6, 4))
 plt.imshow(np.where(np.asarray(built.mosaic.known), np.asarray(built.mosaic.values), np.nan), cmap="gray")
 plt.axis("off")
@@ -74,10 +74,10 @@ plt.show()
 # %% [markdown]
 # ## Takeaways
 #
-# - Pictures of a floor are worth more than odometry by orders of magnitude, and each comes with its covariance.
-# - The slide's Jacobian for features of a mosaic lacks the turn of the second picture;
+# - Images of a floor are worth more than odometry by orders of magnitude, and each comes with its covariance.
+# - The slide's Jacobian for features of a mosaic lacks the turn of the second image;
 #   `jaxloc.slam.mosaic.feature_jacobian` has it.
-# - A picture that overlaps no other is left out and named; nothing is made up.
+# - An image that overlaps no other is left out and named; nothing is made up.
 #
 # ## Next steps
 #

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # 12. Two views
 #
-# Two pictures of a scene that does not move tell how the camera moved: **rotation** and the **direction** of the
+# Two images of a scene that does not move tell how the camera moved: **rotation** and the **direction** of the
 # translation, five numbers. Its length they cannot tell. Many of the matched points are wrong, so the answer has to be
 # found **among false correspondences**; and sometimes there is none, which the estimate must say.
 
@@ -81,7 +81,7 @@ for false, hypotheses in ((0.0, 128), (0.2, 128), (0.4, 128), (0.6, 128), (0.6, 
 # With 60 % of the pairs wrong, one sample of five in a hundred is clean: 128 hypotheses are too few, and the estimate
 # says so. With 512 it is found.
 #
-# A camera that only turns has no direction to tell. Its pictures fit any number of essential matrices, and a solver
+# A camera that only turns has no direction to tell. Its images fit any number of essential matrices, and a solver
 # that returns one of them lies. Here the best rotation is tried as well: where it explains what the translation would,
 # the answer is refused.
 
@@ -98,10 +98,10 @@ print(f"a camera that turns: ok {jnp.mean(still.ok):.0%}")
 # %%
 *colors, true_disparity = data.stereo_motorcycle()
 bytes_left, bytes_right = (cv2.cvtColor(color, cv2.COLOR_RGB2GRAY) for color in colors)
-left, right = (jnp.asarray(grey, jnp.float32) for grey in (bytes_left, bytes_right))
+left, right = (jnp.asarray(gray, jnp.float32) for gray in (bytes_left, bytes_right))
 cameras = [jl.sensors.Pinhole(994.978, 994.978, cx, 254.877) for cx in (311.193, 342.279)]
-found = [opencv.detect(SIFT(), grey, 1500) for grey in (bytes_left, bytes_right)]
-words = [describe(SIFT(), grey, keypoints) for grey, keypoints in zip((bytes_left, bytes_right), found, strict=True)]
+found = [opencv.detect(SIFT(), gray, 1500) for gray in (bytes_left, bytes_right)]
+words = [describe(SIFT(), gray, keypoints) for gray, keypoints in zip((bytes_left, bytes_right), found, strict=True)]
 pairs = match(*words, ratio=0.85)
 first, second = found[0].uv, found[1].uv[pairs.index]
 normalized = [lens.normalize(p) for lens, p in zip(cameras, (first, second), strict=True)]

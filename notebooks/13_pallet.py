@@ -1,7 +1,7 @@
 # %% [markdown]
 # # 13. Find the pallet
 #
-# A fork lift has to know where the pallet stands, to a centimeter and half a degree. A picture tells: **edges of the
+# A fork lift has to know where the pallet stands, to a centimeter and half a degree. An image tells: **edges of the
 # fork holes**, four of them picked by polarity and by a ratio that no range changes, the **kind** of pallet by
 # correlation, and the **pose** from four bearings. At the end the other way to use features: how fast they move tells
 # how the camera moves.
@@ -62,7 +62,7 @@ for peaks, sign, name in ((dark, -1, "darkening"), (light, 1, "lightening")):
     some = np.asarray(peaks.strength) > 2.0
     plt.plot(np.asarray(peaks.columns)[some], sign * np.asarray(peaks.strength)[some], "o", label=name)
 plt.xlabel("column, px")
-plt.ylabel("grey levels a pixel")
+plt.ylabel("gray levels a pixel")
 plt.legend()
 plt.show()
 
@@ -86,7 +86,7 @@ plt.show()
 # %% [markdown]
 # ## Kind and pose
 #
-# `detect_pallet` proposes four edges at each of many ranges, fits a pose, compares the picture there with the front of
+# `detect_pallet` proposes four edges at each of many ranges, fits a pose, compares the image there with the front of
 # each kind, and measures the edges of the best once more. The covariance comes from how parts of the edges scatter.
 
 # %%
@@ -127,7 +127,7 @@ plt.show()
 # ## Flow to twist
 #
 # Features that move: `flow = A v / Z + B w`. With depth (stereo) the twist of the camera follows by linear least
-# squares. Without it only ``v / Z`` counts: a world twice as large, crossed twice as fast, is the same picture. Then
+# squares. Without it only ``v / Z`` counts: a world twice as large, crossed twice as fast, is the same image. Then
 # the direction of travel and the rotation are left, and a wide view is needed to tell one from the other.
 
 # %%

@@ -135,7 +135,7 @@ plt.show()
 # %% [markdown]
 # ## Takeaways
 #
-# - A bundle uses every sight of a point, odometry only neighboring ones: less drift from the same pictures.
+# - A bundle uses every sight of a point, odometry only neighboring ones: less drift from the same images.
 # - Points are eliminated, so thousands of them cost little more than the cameras alone.
 # - Poses are known up to a gauge. A covariance means something only together with what is held.
 #

@@ -178,7 +178,7 @@ def test_readme_code_runs(capsys):
 
 def test_readme_links_lead_somewhere():
     if not (REPOSITORY / "docs").is_dir():
-        pytest.skip("the pictures are not there")
+        pytest.skip("the images are not there")
     for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", README):
         assert (REPOSITORY / target).exists(), target
 

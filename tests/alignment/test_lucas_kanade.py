@@ -24,7 +24,7 @@ ALL = [lk.InverseCompositional(), lk.InverseAdditive(), lk.ForwardsCompositional
 
 
 def texture(rng, shape=(96, 104), smoothness=2.5):
-    """A smooth random picture."""
+    """A smooth random image."""
     v, u = np.meshgrid(np.fft.fftfreq(shape[0]), np.fft.fftfreq(shape[1]), indexing="ij")
     spectrum = np.fft.fft2(rng.normal(size=shape)) * np.exp(-2 * (np.pi * smoothness) ** 2 * (u**2 + v**2))
     picture = np.fft.ifft2(spectrum).real
@@ -111,7 +111,7 @@ def test_descents_reach_the_warp(descent, bound, formulation):
 
 @pytest.mark.parametrize("formulation", [lk.ForwardsCompositional(), lk.ForwardsAdditive()], ids=["composed", "added"])
 def test_newton_has_the_exact_hessian(formulation, x64):
-    """Second-order terms against the Hessian of the cost on a picture that is known between its pixels."""
+    """Second-order terms against the Hessian of the cost on an image that is known between its pixels."""
 
     def picture(u, v, wave):
         return 120 + 40 * wave(0.11 * u + 0.03 * v + 0.3) * wave(0.09 * v - 0.02 * u + 1.2) + 10 * wave(0.15 * v)
@@ -167,7 +167,7 @@ def test_masked_pixels_are_absent(pair):
     wrong = np.float32(template).copy()
     wrong[30:, :] = np.nan
     other = np.where(weights > 0, np.float32(template), 77)
-    # On one scale: smaller pictures mix what is masked with its neighbors.
+    # On one scale: smaller images mix what is masked with its neighbors.
     method = lk.LucasKanade(scales=lk.FullSize())
     one = lk.align(np.float32(image), wrong, Homography, start(), method=method)
     mask = np.ones((SIZE, SIZE), bool)
@@ -210,7 +210,7 @@ def test_gradient_equals_finite_differences(brightness, formulation, pair, x64):
         assert abs(float(jnp.sum(slopes[index] * way)) - expected) <= 1e-4 * max(1.0, abs(expected))
 
 
-@pytest.mark.parametrize("clean", [False, True], ids=["two noisy pictures", "clean template"])
+@pytest.mark.parametrize("clean", [False, True], ids=["two noisy images", "clean template"])
 def test_covariance_is_consistent(clean, pair):
     """NEES over 200 seeds of noise inside the 95 % band of its mean."""
     image, affine = pair[0], truth(Affine)
@@ -281,7 +281,7 @@ def bad(kind, image, template):
 
 @jax.jit
 def differentiated(image, template, place, loss):
-    """An estimate, and derivatives by both pictures."""
+    """An estimate, and derivatives by both images."""
 
     def value(image, template):
         method = lk.LucasKanade(loss=loss, scales=lk.Pyramid(2))

@@ -1,4 +1,4 @@
-"""Mutual information against plain histograms, and alignment of pictures whose grey levels differ by more than gain."""
+"""Mutual information against plain histograms, and alignment of images whose gray levels differ by more than gain."""
 
 from pathlib import Path
 
@@ -95,8 +95,8 @@ def test_equals_a_fine_histogram(rng):  # R-35
     joint = np.histogram2d(a.ravel(), b.ravel(), bins=6)[0] / a.size
     outer = joint.sum(1)[:, None] * joint.sum(0)[None]
     want = np.sum(joint[joint > 0] * np.log(joint[joint > 0] / outer[joint > 0]))
-    # Five bins from one grey level to the next: splines of neighbors do not touch. Each spreads over three bins of
-    # itself, independently in both pictures, which adds no information.
+    # Five bins from one gray level to the next: splines of neighbors do not touch. Each spreads over three bins of
+    # itself, independently in both images, which adds no information.
     got = mutual_information(jnp.asarray(a, jnp.float32), jnp.asarray(b, jnp.float32), bins=28)
     np.testing.assert_allclose(got, want, rtol=1e-3)
 

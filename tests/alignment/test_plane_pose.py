@@ -51,7 +51,7 @@ def test_covariance_is_consistent(scene):
 
     values, ok = jax.lax.map(squared, pictures)
     assert bool(jnp.all(ok))
-    # Interpolated pixels share noise: the map's pixels, at twice the picture's density, are not independent.
+    # Interpolated pixels share noise: the map's pixels, at twice the image's density, are not independent.
     assert 2.0 < float(jnp.mean(values)) < 18.0
 
 

@@ -32,7 +32,7 @@ def render(rotation, center):
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
-    """Folders of the left and the right camera: six pairs, one picture without a board, one of another size."""
+    """Folders of the left and the right camera: six pairs, one image without a board, one of another size."""
     folder = tmp_path_factory.mktemp("inputs")
     rng = np.random.default_rng(2)
     for name in ("left", "right"):
@@ -104,16 +104,16 @@ def test_bad_input_is_one_line_and_writes_nothing(inputs, tmp_path, capsys):
     left, empty = inputs / "left", tmp_path / "empty"
     empty.mkdir()
     refuse("no.png: no such file", [tmp_path / "no.png"])
-    refuse("empty: holds no picture", [empty])
+    refuse("empty: holds no image", [empty])
     refuse("--grid: is '9', must be like 9x6", [left], "--grid", "9")
     refuse("--grid: is 2x5, must have 3 corners", [left], "--grid", "2x5")
     refuse("--square: is -1, must be positive", [left], "--square", "-1")
     refuse("--square: is nan, must be positive", [left], "--square", "nan")
     rubbish = tmp_path / "rubbish.png"
-    rubbish.write_bytes(b"no picture")
-    refuse("rubbish.png: cannot be read as a picture", [rubbish])
+    rubbish.write_bytes(b"no image")
+    refuse("rubbish.png: cannot be read as an image", [rubbish])
     refuse("view10.png: shows no whole board", [left / "view10.png"])
-    refuse("--right: has 1 pictures, the left camera 8", [left], "--right", left / "view1.png")
+    refuse("--right: has 1 images, the left camera 8", [left], "--right", left / "view1.png")
     options = tmp_path / "bad.yaml"
     options.write_text("radial: 5\n")
     refuse("bad.yaml: Glass got radial=5", [left], "--config", options)

@@ -27,17 +27,17 @@ def trip():
 
 @pytest.fixture(scope="module")
 def inputs(trip, tmp_path_factory):
-    """A video, a folder of pictures, and cameras with and without a pitch and a height."""
+    """A video, a folder of images, and cameras with and without a pitch and a height."""
     folder = tmp_path_factory.mktemp("inputs")
-    (folder / "pictures").mkdir()
+    (folder / "images").mkdir()
     video = cv2.VideoWriter(str(folder / "road.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, SHAPE[::-1])
     for index, frame in enumerate(trip.frames()):
         color = cv2.cvtColor(np.rint(frame).astype(np.uint8), cv2.COLOR_GRAY2BGR)
         video.write(color)
         if index < 2:
-            cv2.imwrite(str(folder / "pictures" / f"{index}.png"), color)
+            cv2.imwrite(str(folder / "images" / f"{index}.png"), color)
     video.release()
-    cv2.imwrite(str(folder / "pictures" / "2.png"), np.zeros((*SHAPE, 3), np.uint8))
+    cv2.imwrite(str(folder / "images" / "2.png"), np.zeros((*SHAPE, 3), np.uint8))
     camera = jl.sensors.Pinhole(250.0, 250.0, 159.5, 100.0)
     write_camera(folder / "camera.yaml", CameraFile(camera, SHAPE, height=1.3, pitch=0.03))
     write_camera(folder / "no_pitch.yaml", CameraFile(camera, SHAPE, height=1.3))
@@ -74,7 +74,7 @@ def test_a_video(trip, inputs, tmp_path, capsys):
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == FRAMES
     video.release()
     page = (out / "report.html").read_text()
-    for title in ("Pictures", "Offset", "Heading", "Curvature", "Confidence", "Numbers"):
+    for title in ("Images", "Offset", "Heading", "Curvature", "Confidence", "Numbers"):
         assert f"<h2>{title}</h2>" in page
     assert "http://" not in page
     config = yaml.safe_load((out / "config.yaml").read_text())
@@ -85,10 +85,10 @@ def test_pictures_and_an_unknown_pitch(inputs, tmp_path):
     out = tmp_path / "out"
     options = tmp_path / "options.yaml"
     options.write_text("lane_width: 3.5\nmotion:\n  pitch: 0.005\n")
-    arguments = ["lane", inputs / "pictures", "--camera", inputs / "no_pitch.yaml", "--config", options, "--out", out]
+    arguments = ["lane", inputs / "images", "--camera", inputs / "no_pitch.yaml", "--config", options, "--out", out]
     assert run([str(argument) for argument in arguments]) == 0
-    assert sorted(path.name for path in out.iterdir()) == sorted([*FILES, "pictures"])
-    assert sorted(path.name for path in (out / "pictures").iterdir()) == ["0.jpg", "1.jpg", "2.jpg"]
+    assert sorted(path.name for path in out.iterdir()) == sorted([*FILES, "images"])
+    assert sorted(path.name for path in (out / "images").iterdir()) == ["0.jpg", "1.jpg", "2.jpg"]
     _, lanes = read(out / "lane.csv")
     assert lanes[:, 5].tolist() == [1.0, 1.0, 0.0] and lanes[2, 4] == 0.0, "night is no lane"
     metrics = json.loads((out / "metrics.json").read_text())
@@ -114,10 +114,10 @@ def test_bad_input_is_one_line_and_writes_nothing(inputs, tmp_path, capsys):
     refuse("torn.mp4: is no video that can be decoded", path=torn)
     empty = tmp_path / "empty"
     empty.mkdir()
-    refuse("empty: has no pictures", path=empty)
+    refuse("empty: has no images", path=empty)
     small = tmp_path / "small.png"
     cv2.imwrite(str(small), np.zeros((24, 32), np.uint8))
-    refuse(r"camera.yaml: is of pictures of 320x240, but those of .*small.png are 32x24", path=small)
+    refuse(r"camera.yaml: is of images of 320x240, but those of .*small.png are 32x24", path=small)
     wrong = tmp_path / "up.yaml"
     write_camera(wrong, CameraFile(jl.sensors.Pinhole(250.0, 250.0, 159.5, 100.0), SHAPE, height=1.3, pitch=-0.6))
     refuse("up.yaml: .*check its pitch and height", camera=wrong)

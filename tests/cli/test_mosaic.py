@@ -26,7 +26,7 @@ def drive():
 
 @pytest.fixture(scope="module")
 def inputs(drive, tmp_path_factory):
-    """Six pictures, of which the fourth is blank; odometry; the camera."""
+    """Six images, of which the fourth is blank; odometry; the camera."""
     folder = tmp_path_factory.mktemp("inputs")
     (folder / "frames").mkdir()
     rows = []
@@ -53,7 +53,7 @@ def test_every_file_is_written(drive, inputs, tmp_path, capsys):
     assert run(arguments(inputs, out)) == 0
     assert sorted(path.name for path in out.iterdir()) == FILES
     printed = capsys.readouterr().out
-    assert "5 of 6 pictures joined" in printed and "left out: floor003.png" in printed
+    assert "5 of 6 images joined" in printed and "left out: floor003.png" in printed
 
     stamped = tum.read_trajectory(out / "trajectory.tum")
     assert stamped.start == 50.0 and len(stamped.trajectory) == FRAMES
@@ -95,11 +95,11 @@ def test_bad_input_is_one_line_and_writes_nothing(inputs, tmp_path, capsys, driv
         assert not out.exists()
 
     refuse(r"nowhere: no such folder", frames=tmp_path / "nowhere")
-    refuse(r"holds 0 pictures", frames=tmp_path)
+    refuse(r"holds 0 images", frames=tmp_path)
     refuse(r"no.tum", odometry=tmp_path / "no.tum")
     short = tmp_path / "short.tum"
     short.write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
-    refuse(r"short.tum: has 2 poses for 6 pictures", odometry=short)
+    refuse(r"short.tum: has 2 poses for 6 images", odometry=short)
     low = tmp_path / "low.yaml"
     write_camera(low, CameraFile(drive.camera.ground.camera, shape=SHAPE))
     refuse(r"height_m", camera=low)
@@ -111,5 +111,5 @@ def test_bad_input_is_one_line_and_writes_nothing(inputs, tmp_path, capsys, driv
     broken = tmp_path / "frames"
     broken.mkdir()
     for name in ("a.png", "b.png"):
-        (broken / name).write_bytes(b"no picture")
-    refuse(r"a.png: is no picture", frames=broken, odometry=short)
+        (broken / name).write_bytes(b"no image")
+    refuse(r"a.png: is no image", frames=broken, odometry=short)

@@ -1,4 +1,4 @@
-"""Pictures, folders and videos of the road."""
+"""Images, folders and videos of the road."""
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ def picture(level):
 def folder(tmp_path):
     for number in (10, 9, 100):
         cv2.imwrite(str(tmp_path / f"f{number}.png"), picture(number))
-    (tmp_path / "notes.txt").write_text("no picture")
+    (tmp_path / "notes.txt").write_text("no image")
     return tmp_path
 
 
@@ -36,8 +36,8 @@ def test_folders_are_read_in_natural_order(folder):
     frames = list(recording)
     assert [frame.name for frame in frames] == ["f9.png", "f10.png", "f100.png"]
     assert [frame.index for frame in frames] == [0, 1, 2] and len(recording) == 3 and not recording.is_video
-    assert [int(frame.grey[20, 0]) for frame in frames] == [9, 10, 100]
-    assert frames[0].grey[0, 0] == 210.0 and frames[0].grey.dtype == np.float32, "yellow is bright"
+    assert [int(frame.gray[20, 0]) for frame in frames] == [9, 10, 100]
+    assert frames[0].gray[0, 0] == 210.0 and frames[0].gray.dtype == np.float32, "yellow is bright"
     np.testing.assert_array_equal(frames[1].color, picture(10))
     assert frames[0].time is None
     assert [f.index for f in recording] == [0, 1, 2], "it can be read again"
@@ -45,7 +45,7 @@ def test_folders_are_read_in_natural_order(folder):
 
 def test_a_single_picture(folder):
     (frame,) = open_recording(folder / "f10.png")
-    assert frame.name == "f10.png" and frame.grey.shape == SHAPE
+    assert frame.name == "f10.png" and frame.gray.shape == SHAPE
 
 
 def test_videos_have_times(tmp_path):
@@ -54,7 +54,7 @@ def test_videos_have_times(tmp_path):
     assert recording.is_video and recording.rate == pytest.approx(20.0) and len(recording) == 3
     frames = list(recording)
     assert [frame.time for frame in frames] == pytest.approx([0.0, 0.05, 0.1])
-    np.testing.assert_allclose([frame.grey.mean() for frame in frames], [20, 90, 160], atol=2)
+    np.testing.assert_allclose([frame.gray.mean() for frame in frames], [20, 90, 160], atol=2)
     assert frames[2].name == "road.avi:2"
 
 
@@ -67,13 +67,13 @@ def test_bad_input_names_the_file(folder, tmp_path):
     refuse(tmp_path / "nothing", "no such file or folder")
     empty = tmp_path / "empty"
     empty.mkdir()
-    refuse(empty, "has no pictures")
+    refuse(empty, "has no images")
     torn = tmp_path / "torn.mp4"
     torn.write_bytes(b"\x00\x00\x00\x18ftypmp42" + bytes(500))
     assert refuse(torn, "no video that can be decoded") == torn
     cv2.imwrite(str(folder / "f11.png"), np.zeros((10, 12, 3), np.uint8))
-    assert refuse(folder, r"is 12x10, but the first picture is 64x48").name == "f11.png"
-    (folder / "f11.png").write_bytes(b"no picture")
-    assert refuse(folder, "no picture that can be read").name == "f11.png"
+    assert refuse(folder, r"is 12x10, but the first image is 64x48").name == "f11.png"
+    (folder / "f11.png").write_bytes(b"no image")
+    assert refuse(folder, "no image that can be read").name == "f11.png"
     (folder / "f11.png").write_bytes(b"")
-    refuse(folder / "f11.png", "no picture that can be read")
+    refuse(folder / "f11.png", "no image that can be read")

@@ -1,4 +1,4 @@
-"""Directions beside OpenCV, bits beside a plain loop, and how far both turn with the picture."""
+"""Directions beside OpenCV, bits beside a plain loop, and how far both turn with the image."""
 
 import cv2
 import equinox as eqx

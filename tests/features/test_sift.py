@@ -61,12 +61,12 @@ def test_a_blob_has_its_own_size(x64):
         image = 40 + 150 * np.exp(-((u - 47.3) ** 2 + (v - 50.6) ** 2) / (2 * sigma**2))
         uv, size, _, _ = kept(sift(jnp.asarray(image), capacity=8))
         np.testing.assert_allclose(uv[0], [47.3, 50.6], atol=0.06)
-        # sigma / sqrt(k) with k = 2^(1/3), and the camera's blur that the picture is thought to have.
+        # sigma / sqrt(k) with k = 2^(1/3), and the camera's blur that the image is thought to have.
         assert 0.5 * size[0] == pytest.approx(sigma / 2 ** (1 / 6), rel=0.03)
 
 
 def test_keypoints_turn_with_the_picture(picture, found):
-    """By a quarter, which no interpolation disturbs (but the doubled picture's last row)."""
+    """By a quarter, which no interpolation disturbs (but the doubled image's last row)."""
     uv, _, angle, values = kept(found)
     turned = kept(find(jnp.asarray(np.ascontiguousarray(np.rot90(picture, -1)), jnp.float32)))
     expected = np.stack([383 - uv[:, 1], uv[:, 0]], axis=1)

@@ -35,7 +35,7 @@ def test_sums_of_floats_equal_numpy(dtype, rng):
 
 
 def test_sums_that_wrap_around_are_exact(rng):
-    """A picture whose sum exceeds 31 bits; the boxes' sums do not."""
+    """An image whose sum exceeds 31 bits; the boxes' sums do not."""
     image = rng.integers(0, 2**30, (30, 41)).astype(np.int32)
     boxes = np.stack([r := np.arange(29), c := np.arange(29) + 5, r + 1, c + 1], axis=1)
     found = box_sums(integral(jnp.asarray(image)), jnp.asarray(boxes, jnp.int32))
@@ -52,8 +52,8 @@ def row_of_pixels(sums, rows):
     return (sums[rows + 1, 1:] - sums[rows, 1:] - sums[rows + 1, :-1] + sums[rows, :-1],)
 
 
-def test_large_pictures_keep_every_grey_level(rng):
-    """Sums of float32 would be off by whole grey levels after a million pixels."""
+def test_large_pictures_keep_every_gray_level(rng):
+    """Sums of float32 would be off by whole gray levels after a million pixels."""
     image = rng.integers(0, 256, (1100, 1000)).astype(np.float32)
     rows = jnp.array([700, 1099])
     assert (filter_boxes(row_of_pixels, 4, jnp.asarray(image), rows)[0] == image[[700, 1099]]).all()

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import uniform_filter
 from scipy.stats import rankdata
 
-from jaxloc.images.normalization import as_grey, fit_gain_bias, rank_transform, standardize, standardize_locally
+from jaxloc.images.normalization import as_gray, fit_gain_bias, rank_transform, standardize, standardize_locally
 
 
 @pytest.fixture
@@ -66,6 +66,6 @@ def test_rank_counts_darker_neighbors(picture):
 
 
 def test_bytes_keep_their_values_and_color_is_refused():
-    assert as_grey(np.array([[7, 255]], np.uint8)).tolist() == [[7.0, 255.0]]
+    assert as_gray(np.array([[7, 255]], np.uint8)).tolist() == [[7.0, 255.0]]
     with pytest.raises(ValueError, match="two axes"):
-        as_grey(np.zeros((4, 4, 3)))
+        as_gray(np.zeros((4, 4, 3)))

@@ -1,4 +1,4 @@
-"""Windows, edges, and the clothoid in a filter, against pictures whose truth is known."""
+"""Windows, edges, and the clothoid in a filter, against images whose truth is known."""
 
 import equinox as eqx
 import jax
@@ -124,7 +124,7 @@ def test_the_motion_follows_the_road(x64):
 
 @eqx.filter_jit
 def step(state, image, ride, first):
-    """A picture through the filter."""
+    """An image through the filter."""
     idle = ExtendedKalmanFilter(LaneMotion(), BorderSensor(camera(), *[jnp.zeros(1)] * 4))
     predicted = jax.tree.map(lambda a, b: jnp.where(first, a, b), state, idle.predict(state, ride))
     borders = measure(image, camera(), predicted.gaussian())

@@ -44,7 +44,7 @@ def test_view_is_the_warp_of_opencv():
 
 
 def test_every_row_shows_the_same_width_of_ground():
-    """K-34: the trapezoid is narrow far away in the picture, and equally wide on the road."""
+    """K-34: the trapezoid is narrow far away in the image, and equally wide on the road."""
     grid = GroundGrid.for_speed(25.0, rows=8, columns=16)
     u = [ground().project_components(jnp.full(2, x), grid.left[jnp.array([0, -1])])[0] for x in grid.ahead]
     widths = np.array([float(row[1] - row[0]) for row in u])

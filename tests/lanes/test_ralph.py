@@ -78,7 +78,7 @@ def test_road_with_marks(template, wrong_pitch):
 def test_road_without_marks(plain_template):
     errors, _, ok = errors_of(ROAD.without_marks(), plain_template, 0.0, 16)
     assert ok.mean() >= 0.9
-    # Half the pixels of the benchmark's pictures, and a template of one picture: its tracks wander by 3 cm.
+    # Half the pixels of the benchmark's images, and a template of one image: its tracks wander by 3 cm.
     offset, _, curvature, _ = np.median(np.abs(errors), axis=0)
     assert offset < 0.08 and curvature < 4e-4
 

@@ -28,9 +28,9 @@ FOREIGN = Road(
 
 
 def follow(trip, views, adaptation):
-    """How far the offset is off at each picture of a drive, and whether the lane was believed.
+    """How far the offset is off at each image of a drive, and whether the lane was believed.
 
-    The vehicle's odometry carries the lane from picture to picture, also where the road looks like nothing known.
+    The vehicle's odometry carries the lane from image to image, also where the road looks like nothing known.
     """
     fit, errors, believed = ralph.LaneFit(*trip.lanes[0, :3]), [], []
     template = ralph.capture(views[0], fit)

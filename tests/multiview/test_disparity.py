@@ -24,7 +24,7 @@ COSTS = [SSD(), ZNCC(), Census()]
 
 
 def scene(shift, seed=0, smooth=1.5):
-    """A textured wall that the right picture shows further left by a shift, exactly: both come from one wave field."""
+    """A textured wall that the right image shows further left by a shift, exactly: both come from one wave field."""
     rng = np.random.default_rng(seed)
     wide = gaussian_filter(rng.uniform(0, 255, (SHAPE[0], 4 * (SHAPE[1] + 20))), (smooth, 4 * smooth)) * 6
     wide += 128 - wide.mean()

@@ -15,7 +15,7 @@ BATCH = 40
 
 
 def views(rng, n, planar=False, turn_only=False):
-    """Pixels of two pictures and the true matrix, of unit norm, ``x1^T F x2 = 0``."""
+    """Pixels of two images and the true matrix, of unit norm, ``x1^T F x2 = 0``."""
     R = Rotation.from_rotvec(rng.uniform(-0.2, 0.2, 3)).as_matrix()
     t = np.zeros(3) if turn_only else rng.normal(size=3)
     points = np.column_stack([rng.uniform(-2, 2, (n, 2)), rng.uniform(4, 12, n)])

@@ -109,7 +109,7 @@ def test_gradient(x64):
 
 
 def uncalibrated(rng, turn=(0.05, -0.1, 0.15), step=(0.9, 0.1, 0.2)):
-    """Points in two pictures of a camera that turned and moved, and the fundamental matrix ``x1^T F x2 = 0``."""
+    """Points in two images of a camera that turned and moved, and the fundamental matrix ``x1^T F x2 = 0``."""
     K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
     T = SE3(SO3.exp(jnp.asarray(turn)), jnp.asarray(step))
     points = np.column_stack([rng.uniform(-1, 2, (40, 1)), rng.uniform(-1, 1, (40, 1)), rng.uniform(4, 9, (40, 1))])

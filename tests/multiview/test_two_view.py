@@ -23,7 +23,7 @@ def estimate(first, second, valid, key):
 
 
 def pairs(seed, false=0.4, sigma=SIGMA, turn=0.15, step=1.0, planar=False):
-    """Pixels about the center of two pictures, and ``T_first_second``."""
+    """Pixels about the center of two images, and ``T_first_second``."""
     rng = np.random.default_rng(seed)
     R = Rotation.from_rotvec(rng.uniform(-turn, turn, 3)).as_matrix()
     t = rng.normal(size=3)
@@ -153,7 +153,7 @@ def test_too_few_are_told():
 
 
 def test_scale_is_free(x64):  # K-88
-    """Twice the depth and twice the translation: the same pictures."""
+    """Twice the depth and twice the translation: the same images."""
     T = SE3.exp(jnp.array([0.6, 0.1, 0.3, 0.05, -0.1, 0.15]))
     points = jnp.asarray(np.random.default_rng(0).uniform(-2, 2, (10, 3)) + [0, 0, 6])
     far = SE3(T.rotation, 2.0 * T.translation)

@@ -127,5 +127,5 @@ def test_degenerate_sets_stay_finite(dtype):
         slopes = pull(jax.tree.map(jnp.ones_like, poses))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((poses, slopes)))
     assert not absolute(jnp.asarray(rays, dtype), jnp.asarray(points, dtype)).valid[1:].any()
-    # Equal pictures (case 0) have solutions too, though not one translation.
+    # Equal images (case 0) have solutions too, though not one translation.
     assert not relative(jnp.asarray(first, dtype), jnp.asarray(second, dtype)).valid[1:4].any()

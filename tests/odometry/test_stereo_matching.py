@@ -1,4 +1,4 @@
-"""The front end on pictures whose truth is known: T-11, T-71, T-72."""
+"""The front end on images whose truth is known: T-11, T-71, T-72."""
 
 import jax.numpy as jnp
 import numpy as np

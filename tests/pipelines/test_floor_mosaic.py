@@ -1,4 +1,4 @@
-"""Mosaics from simulated drives: errors against exact truth, loops closed, bad pictures left out and named."""
+"""Mosaics from simulated drives: errors against exact truth, loops closed, bad images left out and named."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ FRAMES = 24
 
 @pytest.fixture(scope="module")
 def drive():
-    """A loop of small pictures with a distorting lens."""
+    """A loop of small images with a distorting lens."""
     camera = floor.make_camera(SHAPE, height=HEIGHT)
     return floor.drive_loop(3, num_frames=FRAMES, step=0.008, camera=camera, sigmas=(1.5e-4, 1.5e-4, 4e-3))
 
@@ -46,7 +46,7 @@ def test_frame_errors_and_loop_closure(drive, built):
 
 
 def test_the_mosaic_is_the_floor(drive, built):
-    """Grey levels against the texture at the same places, gain and bias aside: no exposure steps."""
+    """Gray levels against the texture at the same places, gain and bias aside: no exposure steps."""
     mosaic, texture = built.mosaic, drive.floor
     x, y = (np.asarray(axis, np.float64) for axis in mosaic.raster.centers())
     u, v = (x - texture.origin[0]) / texture.resolution, (y - texture.origin[1]) / texture.resolution
@@ -87,7 +87,7 @@ def test_tracking_on_a_second_drive(drive, built):
 
 
 def test_bad_pictures_are_left_out_and_named(drive):
-    """A blank picture, one of another place, one with nan pixels (which is used)."""
+    """A blank image, one of another place, one with nan pixels (which is used)."""
     frames = drive.frames[:8].astype(np.float32)
     frames[2] = 90.0
     frames[5] = floor.Photographer(floor.make_floor(99, low=(0.0, 0.0), high=(0.1, 0.1)), drive.camera).take(
@@ -116,7 +116,7 @@ def test_a_far_picture_has_no_overlap(drive):
 
 def test_wrong_input_is_refused(drive):
     ground = drive.camera.ground
-    with pytest.raises(ValueError, match="two or more grey pictures"):
+    with pytest.raises(ValueError, match="two or more gray images"):
         floor_mosaic.make_mosaic(drive.frames[:1], np.zeros((0, 3)), ground)
     with pytest.raises(ValueError, match="need 2 motions"):
         floor_mosaic.make_mosaic(drive.frames[:3], np.zeros((3, 3)), ground)

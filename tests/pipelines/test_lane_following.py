@@ -20,7 +20,7 @@ CONFIG = Config(sequence=True, interval=0.1)
 class Picture(eqx.Module):
     """What a reader gives, and no more."""
 
-    grey: np.ndarray
+    gray: np.ndarray
     time: float | None = None
 
 
@@ -123,7 +123,7 @@ def test_a_saved_template_starts_without_paint():
 
 
 def test_an_unknown_pitch_is_estimated(pictures, trip):
-    found = estimate_pitch([picture.grey for picture in pictures[:6]], camera(pitch=0.0))
+    found = estimate_pitch([picture.gray for picture in pictures[:6]], camera(pitch=0.0))
     assert found.ok and abs(found.value - 0.03) < 0.005
     steps = list(follow(pictures[:6], camera(pitch=0.0), CONFIG, pitch_known=False))
     assert all(step.ok for step in steps)

@@ -39,8 +39,8 @@ def test_signs_are_those_of_the_docstring(x64):
     ahead = jnp.array([20.0])
     level, down, rolled = (jl.sensors.GroundCamera(camera(), 1.4, *angles) for angles in ((), (0.02,), (0.0, 0.1)))
     row = [float(g.project_components(ahead, 0.0 * ahead)[1][0]) for g in (level, down)]
-    assert row[1] < row[0], "looking further down moves the road up in the picture"
-    # With the right side of the camera down, the horizon falls to the left in the picture.
+    assert row[1] < row[0], "looking further down moves the road up in the image"
+    # With the right side of the camera down, the horizon falls to the left in the image.
     left, right = (float(rolled.vanishing_point(jnp.array(h))[1]) for h in (0.2, -0.2))
     assert left > right
 

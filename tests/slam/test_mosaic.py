@@ -25,7 +25,7 @@ def planar(rows):
 
 @pytest.fixture(scope="module")
 def drive():
-    """Pictures a tenth of their height apart, through a lens with k1 = -0.3."""
+    """Images a tenth of their height apart, through a lens with k1 = -0.3."""
     return floor.drive_loop(5, num_frames=60, step=0.003, camera=floor.make_camera(SHAPE, height=HEIGHT))
 
 
@@ -42,7 +42,7 @@ def patches(drive, rectifier):
 
 @pytest.fixture(scope="module")
 def world(drive, patches):
-    """A mosaic of six pictures at their true poses."""
+    """A mosaic of six images at their true poses."""
     poses = planar(drive.poses[:6])
     return mosaic.blend(patches, poses, mosaic.enclose(poses, patches.raster))
 
@@ -252,7 +252,7 @@ def test_one_program_serves_all_poses(drive, rectifier, world):
 
 
 def test_gradients_of_the_tracked_pose(x64, drive):
-    """By the picture and by the height of the camera, against central differences."""
+    """By the image and by the height of the camera, against central differences."""
     ground = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), drive.camera.ground)
     view = FloorView.of(ground, SHAPE, shape=(80, 80), resolution=PIXEL, black=6.0)
     rectifier = view.rectifier()

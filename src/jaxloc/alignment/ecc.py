@@ -23,17 +23,17 @@ def align(
 ) -> Estimate:
     """Finds the warp under which image and template correlate most: ECC.
 
-    Maximizes ``rho(W) = <i(W), t> / |i(W)| |t|`` of the zero-mean pictures. Unlike OpenCV's `findTransformECC` it does
+    Maximizes ``rho(W) = <i(W), t> / |i(W)| |t|`` of the zero-mean images. Unlike OpenCV's `findTransformECC` it does
     not throw, tells how sure the result is, and can be differentiated and batched.
 
     Args:
-        image: grey levels, nan where there is no picture.
-        template: grey levels, nan where it does not count.
+        image: gray levels, nan where there is no image.
+        template: gray levels, nan where it does not count.
         warp: its class.
         initial: where to start, a warp from template pixels to image pixels; the identity by default.
         method: as in `lucas_kanade.align`; its brightness is replaced by `Correlation`.
         weights: of the template's pixels, or a mask.
-        sigma: standard deviation of the image's noise, grey levels.
+        sigma: standard deviation of the image's noise, gray levels.
 
     Returns:
         Estimate of the warp, as of `lucas_kanade.align`.

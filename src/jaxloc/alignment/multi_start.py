@@ -52,14 +52,14 @@ def align(
     there are aligned to the end, and the best of them is the answer.
 
     Args:
-        image: grey levels.
-        template: grey levels.
+        image: gray levels.
+        template: gray levels.
         warp: its class.
         seeds: starts, a stack of warps of any class along a leading axis.
         method: as in `lucas_kanade.align`.
         keep: seeds that are aligned to the end; static.
         weights: of the template's pixels.
-        sigma: standard deviation of the image's noise, grey levels.
+        sigma: standard deviation of the image's noise, gray levels.
 
     Returns:
         Estimate of the warp, as of `lucas_kanade.align`.

@@ -1,6 +1,6 @@
-"""Shift, rotation and scale of whole pictures from their spectra: no start is needed, others may start from here.
+"""Shift, rotation and scale of whole images from their spectra: no start is needed, others may start from here.
 
-A shift turns the phases of a spectrum and leaves its amplitude as it is [R-33]; rotation and scale of a picture rotate
+A shift turns the phases of a spectrum and leaves its amplitude as it is [R-33]; rotation and scale of an image rotate
 and scale the amplitude, and become shifts in logarithmic polar coordinates [R-34].
 """
 
@@ -14,13 +14,13 @@ from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc.alignment.correlation.peaks import find_peaks
 from jaxloc.images.interpolation import Bicubic, sample
-from jaxloc.images.normalization import as_grey
+from jaxloc.images.normalization import as_gray
 from jaxloc.images.spectrum import LogPolar, amplitude, hann
 from jaxloc.images.warps import Similarity, Translation
 from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers import Estimate, Status
 
-_LEAST_HEIGHT = 6.0  # of a trusted peak, in standard deviations of the surface of unrelated pictures
+_LEAST_HEIGHT = 6.0  # of a trusted peak, in standard deviations of the surface of unrelated images
 _NEWTON_STEPS = 4
 
 
@@ -31,7 +31,7 @@ class _Peak(eqx.Module):
         uv: current from previous, px.
         covariance: px^2.
         information: its inverse.
-        height: of the peak, 1 for equal pictures.
+        height: of the peak, 1 for equal images.
         ok: True if it stands out.
     """
 
@@ -46,21 +46,21 @@ class _Peak(eqx.Module):
 def translation(
     previous: Num[Array, "h w"] | Any, current: Num[Array, "h w"] | Any, *, bandwidth: float = 0.25
 ) -> Estimate:
-    """Finds how far a picture has moved: ``current(x + t) ~ previous(x)``, by phase correlation.
+    """Finds how far an image has moved: ``current(x + t) ~ previous(x)``, by phase correlation.
 
-    With the cross-spectrum ``R = conj(F_previous) F_current`` of the pictures under Hann windows,
+    With the cross-spectrum ``R = conj(F_previous) F_current`` of the images under Hann windows,
     ``c(t) = sum_f w(f) R(f) / |R(f)| exp(2 pi i f.t)`` has a sharp peak. w is a Gaussian low-pass. The highest pixel is
     refined by Newton steps on this trigonometric sum itself; the last one carries the derivatives of the solution.
 
     Args:
-        previous: grey levels.
-        current: grey levels, of the same shape.
+        previous: gray levels.
+        current: gray levels, of the same shape.
         bandwidth: standard deviation of w, cycles per pixel.
 
     Returns:
-        Estimate of a `Translation` from previous to current pixels, at most half a picture. `cost` is one minus the
+        Estimate of a `Translation` from previous to current pixels, at most half an image. `cost` is one minus the
         peak's height; the covariance follows from how far phases scatter about their plane. `ok` is False where nothing
-        stands out: flat or unrelated pictures.
+        stands out: flat or unrelated images.
 
     Raises:
         ValueError: shapes differ.
@@ -90,18 +90,18 @@ def similarity(
     bandwidth: float = 0.25,
     rounds: int = 2,
 ) -> Estimate:
-    """Finds rotation, scale and shift between two pictures: ``image(W(x)) ~ template(x)`` (Fourier-Mellin).
+    """Finds rotation, scale and shift between two images: ``image(W(x)) ~ template(x)`` (Fourier-Mellin).
 
     The amplitudes of both spectra, high-pass filtered and in logarithmic polar coordinates, are phase-correlated:
-    their shift is rotation, up to half a turn, and the logarithm of scale. Both half turns are undone and the pictures
+    their shift is rotation, up to half a turn, and the logarithm of scale. Both half turns are undone and the images
     phase-correlated; the higher peak decides. A second round starts from the result of the first, so that both windows
     show the same part of the scene.
 
     Args:
-        image: grey levels.
-        template: grey levels, of the same shape.
+        image: gray levels.
+        template: gray levels, of the same shape.
         sampling: of the spectrum.
-        bandwidth: of the phase correlation of the pictures, cycles per pixel.
+        bandwidth: of the phase correlation of the images, cycles per pixel.
         rounds: static number of rounds.
 
     Returns:
@@ -151,10 +151,10 @@ def _choose(index: Array, records: list) -> Any:
 
 def _same_shape(a: Any, b: Any) -> tuple[Array, Array, Bool[Array, ""]]:
     """Finite floats of one dtype, and whether both have finite pixels."""
-    a = as_grey(a)
-    b = as_grey(b, a.dtype)
+    a = as_gray(a)
+    b = as_gray(b, a.dtype)
     if a.shape != b.shape:
-        raise ValueError(f"Phase correlation needs pictures of one shape; got {a.shape} and {b.shape}.")
+        raise ValueError(f"Phase correlation needs images of one shape; got {a.shape} and {b.shape}.")
     known = [jnp.isfinite(x) for x in (a, b)]
     return _filled(a, known[0]), _filled(b, known[1]), jnp.any(known[0]) & jnp.any(known[1])
 
@@ -204,7 +204,7 @@ def _moments(factors: Float[Array, "2 h w"], uv: Float[Array, "2"]) -> tuple[Arr
 
 
 def _correlate(a: Float[Array, "h w"], b: Float[Array, "h w"], bandwidth: float) -> _Peak:
-    """The peak of the phase correlation of two windowed pictures."""
+    """The peak of the phase correlation of two windowed images."""
     factors, weight = _phases(a, b, bandwidth)
     frozen, shape = lax.stop_gradient(factors), jnp.array(a.shape[::-1])
     surface = jnp.fft.ifft2(lax.complex(frozen[0], frozen[1])).real * a.size
@@ -257,7 +257,7 @@ def _scatter(factors: Array, uv: Array, hessian: Array, ok: Array) -> tuple[Arra
 
 
 def _about_center(turned: Float[Array, "2"], shape: tuple[int, int]) -> Similarity:
-    """A rotation and a change of scale (its logarithm) about the picture's center."""
+    """A rotation and a change of scale (its logarithm) about the image's center."""
     center = _center(shape, turned.dtype)
     zero = jnp.zeros((), turned.dtype)
     inner = Similarity.exp(jnp.stack([zero, zero, turned[0], turned[1]]))
@@ -280,7 +280,7 @@ def _turn(image: Array, warp: Similarity, polar_template: Array, sampling: LogPo
     """What is left of rotation and log-scale between the image under a warp and the template."""
     polar = sampling.sample(amplitude(_seen(image, warp)))
     peak = _correlate(sampling.tapered(polar_template), sampling.tapered(polar), 0.15)
-    # A picture that is larger by s has a spectrum smaller by s.
+    # An image that is larger by s has a spectrum smaller by s.
     return sampling.turn(peak.uv), peak
 
 

@@ -1,4 +1,4 @@
-"""The pose of a camera straight from pixels: its picture laid upon a map image of a plane."""
+"""The pose of a camera straight from pixels: its image laid upon a map image of a plane."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc.images.interpolation import Bicubic, sample_components
-from jaxloc.images.normalization import as_grey
+from jaxloc.images.normalization import as_gray
 from jaxloc.images.pyramid import gaussian_pyramid
 from jaxloc.poses import SE3
 from jaxloc.poses.lie_group import matmul
@@ -17,11 +17,11 @@ from jaxloc.solvers.cholesky import factor
 
 
 class Appearance(eqx.Module):
-    """What is solved for: a pose, and how grey levels of the picture follow from those of the map.
+    """What is solved for: a pose, and how gray levels of the image follow from those of the map.
 
     Attributes:
         pose: ``T_world_camera``.
-        gain: contrast of the picture over that of the map.
+        gain: contrast of the image over that of the map.
         bias: in standard deviations of the map.
     """
 
@@ -31,16 +31,16 @@ class Appearance(eqx.Module):
 
 
 class PlaneAppearance(Problem):
-    """Differences between a picture and the map points that it shows, over their standard deviation.
+    """Differences between an image and the map points that it shows, over their standard deviation.
 
     Attributes:
-        camera: of the picture at this scale.
-        image: grey levels.
+        camera: of the image at this scale.
+        image: gray levels.
         points: of the map, world frame, "3 n".
         values: of the map there, zero mean and unit variance.
-        spread: standard deviation of the map's grey levels.
-        mean: of the map's grey levels.
-        sigma: standard deviation of a difference, grey levels.
+        spread: standard deviation of the map's gray levels.
+        mean: of the map's gray levels.
+        sigma: standard deviation of a difference, gray levels.
         loss: robust kernel.
     """
 
@@ -54,7 +54,7 @@ class PlaneAppearance(Problem):
     loss: Any = Quadratic()
 
     def look(self, pose: SE3) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-        """The picture at the map's points, and where there is one."""
+        """The image at the map's points, and where there is one."""
         rotation = pose.rotation.matrix()
         x, y, z = matmul(rotation.T, self.points - pose.translation[:, None])
         front = self.camera.in_front_components(x, y, z)
@@ -82,17 +82,17 @@ def refine_pose(
     levels: int = 3,
     stride: int = 2,
 ) -> Estimate:
-    """Pose of a camera from its picture of a textured plane, starting at a guess.
+    """Pose of a camera from its image of a textured plane, starting at a guess.
 
     Minimizes ``sum rho((image(project(T^-1 X_i)) - gain Z_i - bias) / sigma)`` over the pose ``T = T_world_camera``,
-    gain and bias, for the map's pixels X_i with grey levels Z_i, from coarse to fine.
+    gain and bias, for the map's pixels X_i with gray levels Z_i, from coarse to fine.
 
     Args:
-        image: the camera's picture, grey levels.
+        image: the camera's image, gray levels.
         plane: the map.
         camera: intrinsics and lens.
         initial: guess of ``T_world_camera``.
-        sigma: standard deviation of a difference, grey levels: noise of the picture, faults of the map.
+        sigma: standard deviation of a difference, gray levels: noise of the image, faults of the map.
         loss: robust kernel, in sigmas.
         levels: of the pyramid; static.
         stride: of the map's pixels that are compared at the finest level; static.
@@ -110,13 +110,13 @@ def refine_pose(
         >>> plane = jl.sensors.TexturedPlane(texture, 0.02, jl.poses.SE3.identity())
         >>> camera = jl.sensors.Pinhole(100.0, 100.0, 47.5, 47.5)
         >>> truth = jl.poses.SE3.exp(jnp.array([0.95, 0.95, -1.5, 0.0, 0.0, 0.05]))
-        >>> picture = plane.predict(camera, truth, shape=(96, 96)).image
+        >>> image = plane.predict(camera, truth, shape=(96, 96)).image
         >>> start = truth @ jl.poses.SE3.exp(jnp.array([0.03, -0.02, 0.05, 0.01, 0.0, 0.01]))
-        >>> fit = jl.alignment.plane_pose.refine_pose(picture, plane, camera, start)
+        >>> fit = jl.alignment.plane_pose.refine_pose(image, plane, camera, start)
         >>> bool(fit.ok), bool(jnp.linalg.norm(fit.value.translation - truth.translation) < 0.01)
         (True, True)
     """
-    image = as_grey(image, plane.texture.dtype)
+    image = as_gray(image, plane.texture.dtype)
     pictures, maps = gaussian_pyramid(image, levels=levels), gaussian_pyramid(plane.texture, levels=levels)
     one = jnp.ones((), image.dtype)
     state = Appearance(initial, one, jnp.zeros_like(one))
@@ -124,7 +124,7 @@ def refine_pose(
     fit, problem = None, None
     for level in reversed(range(levels)):
         problem = _problem(pictures[level], maps[level], plane, camera, level, sigma, loss, stride if level == 0 else 1)
-        # Grey levels between pixels are smooth but not quadratic: no more digits are to be had than these.
+        # Gray levels between pixels are smooth but not quadratic: no more digits are to be had than these.
         solver = LevenbergMarquardt(rtol=1e-4 if image.dtype == jnp.float32 else 1e-7)
         fit = solve(problem, state, solver=solver)
         state = fit.value

@@ -129,7 +129,7 @@ def track(
     """Track what moves: from a stereo camera, or from the detections of any detector.
 
     Writes tracks.csv, metrics.json, report.html and config.yaml; of detections also tracks_mot.txt (frames from 1), of
-    a stereo camera also trajectory.txt and pictures. Rows of tracks.csv are in m in the frame of the first camera; of
+    a stereo camera also trajectory.txt and images. Rows of tracks.csv are in m in the frame of the first camera; of
     MOT detections they are of the center of the box in px, and z, vz and var_z are empty.
     """
     if (sequence is None) == (detections is None):
@@ -164,7 +164,7 @@ def lane(
     """Find where in its lane a vehicle is, and how the lane bends.
 
     Writes lane.csv (m left of the lane's center, rad, 1/m), borders.csv (columns of the lane's borders in the image),
-    annotated pictures or a video, metrics.json, report.html and config.yaml.
+    annotated images or a video, metrics.json, report.html and config.yaml.
     """
     from jaxloc.cli.lane import command
 
@@ -173,17 +173,17 @@ def lane(
 
 @app.command()
 def calibrate(
-    images: Annotated[list[Path], typer.Argument(help="Pictures of a chessboard by one camera, or folders of them.")],
+    images: Annotated[list[Path], typer.Argument(help="Images of a chessboard by one camera, or folders of them.")],
     grid: Annotated[str, typer.Option("--grid", metavar="9x6", help="Inner corners of the board: along, down.")],
     square: Annotated[float, typer.Option("--square", metavar="M", help="Edge of a square, m.")],
     right: Annotated[
         list[Path] | None,
-        typer.Option("--right", metavar="PATH", help="Pictures (or a folder) of the right camera of a stereo rig."),
+        typer.Option("--right", metavar="PATH", help="Images (or a folder) of the right camera of a stereo rig."),
     ] = None,
     out: _Out = Path("out"),
     config: _Config = None,
 ) -> int:
-    """Find focal lengths, principal point and lens of a camera, or of two, from pictures of a chessboard.
+    """Find focal lengths, principal point and lens of a camera, or of two, from images of a chessboard.
 
     Writes camera.yaml (OpenCV's format, with the parameters' covariance), of two cameras also right.yaml and
     stereo.yaml (with rectification), corners.csv, metrics.json, report.html and config.yaml.
@@ -195,10 +195,10 @@ def calibrate(
 
 @app.command()
 def mosaic(
-    frames: Annotated[Path, typer.Argument(help="Folder of pictures of a floor, in the order of their names.")],
+    frames: Annotated[Path, typer.Argument(help="Folder of images of a floor, in the order of their names.")],
     odometry: Annotated[
         Path,
-        typer.Option("--odometry", metavar="FILE", help="Poses of the camera over the floor (TUM), a row a picture."),
+        typer.Option("--odometry", metavar="FILE", help="Poses of the camera over the floor (TUM), a row an image."),
     ],
     camera: Annotated[
         Path,
@@ -207,7 +207,7 @@ def mosaic(
     out: _Out = Path("out"),
     config: _Config = None,
 ) -> int:
-    """Join pictures of a floor to one map, to be localized in later.
+    """Join images of a floor to one map, to be localized in later.
 
     Writes mosaic.png, mosaic.yaml (resolution and origin), trajectory.tum, metrics.json, report.html and config.yaml.
     """

@@ -44,7 +44,7 @@ class CameraFile(eqx.Module):
 
     Attributes:
         camera: focal lengths, principal point and lens.
-        shape: (rows, columns) of its pictures; None where the file does not say.
+        shape: (rows, columns) of its images; None where the file does not say.
         height: over the ground, m.
         pitch: rad, positive looks down.
         roll: rad, positive when the right side of the camera is turned down.
@@ -73,13 +73,13 @@ class CameraFile(eqx.Module):
         return self.height
 
     def require_shape(self) -> tuple[int, int]:
-        """Rows and columns of the pictures.
+        """Rows and columns of the images.
 
         Raises:
             DataError: when the file does not give them.
         """
         if self.shape is None:
-            raise DataError(self.path, "has no image_width and image_height: add the size of the pictures, px")
+            raise DataError(self.path, "has no image_width and image_height: add the size of the images, px")
         return self.shape
 
     def sigmas(self) -> dict[str, float]:

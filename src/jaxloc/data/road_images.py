@@ -1,4 +1,4 @@
-"""Pictures of the road ahead: a single one, a folder of them, or a video; frame by frame.
+"""Images of the road ahead: a single one, a folder of them, or a video; frame by frame.
 
 Host code: a frame is decoded when it is asked for.
 """
@@ -23,32 +23,32 @@ _VIDEOS = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".
 
 
 class LaneFrame(eqx.Module):
-    """One picture of the road.
+    """One image of the road.
 
     Args:
         index: number of the frame, from 0.
         name: of its file, or of the video with the number of the frame.
-        time: s since the first frame, by the video's clock; None for pictures, which have none.
-        grey: mean of red and green, 0 to 255: yellow paint is as bright as white then.
+        time: s since the first frame, by the video's clock; None for images, which have none.
+        gray: mean of red and green, 0 to 255: yellow paint is as bright as white then.
         color: the original, in OpenCV's order blue, green, red.
     """
 
     index: int
     name: str
     time: float | None
-    grey: Float32[np.ndarray, "h w"]
+    gray: Float32[np.ndarray, "h w"]
     color: UInt8[np.ndarray, "h w 3"]
 
 
 class LaneRecording(eqx.Module):
-    """Pictures of the road in the order in which they were taken.
+    """Images of the road in the order in which they were taken.
 
     Iterating decodes them, from the first one every time.
 
     Args:
         path: what was opened.
-        files: the pictures, or the one video.
-        rate: frames a second of a video; None for pictures.
+        files: the images, or the one video.
+        rate: frames a second of a video; None for images.
         shape: rows and columns.
         count: frames; what a video says of itself, which may be more than can be decoded.
     """
@@ -75,8 +75,8 @@ class LaneRecording(eqx.Module):
     def _picture_frame(self, index: int, path: Path) -> LaneFrame:
         color = _read_picture(path)
         if color.shape[:2] != self.shape:
-            raise DataError(path, f"is {_size(color.shape)}, but the first picture is {_size(self.shape)}")
-        return LaneFrame(index, path.name, None, _grey(color), color)
+            raise DataError(path, f"is {_size(color.shape)}, but the first image is {_size(self.shape)}")
+        return LaneFrame(index, path.name, None, _gray(color), color)
 
     def _video_frames(self, rate: float) -> Iterator[LaneFrame]:
         with _open_video(self.path) as video:
@@ -87,15 +87,15 @@ class LaneRecording(eqx.Module):
                     return
                 if color.shape[:2] != self.shape:
                     raise DataError(self.path, f"frame {index} is {_size(color.shape)}, not {_size(self.shape)}")
-                yield LaneFrame(index, f"{self.path.name}:{index}", index / rate, _grey(color), color)
+                yield LaneFrame(index, f"{self.path.name}:{index}", index / rate, _gray(color), color)
                 index += 1
 
 
 def open_recording(path: Path | str) -> LaneRecording:
-    """Opens pictures of the road; the first one is decoded to see that it can be.
+    """Opens images of the road; the first one is decoded to see that it can be.
 
     Args:
-        path: a picture, a video, or a folder of pictures (in the natural order of their names: 9 before 10).
+        path: an image, a video, or a folder of images (in the natural order of their names: 9 before 10).
 
     Returns:
         The recording.
@@ -109,7 +109,7 @@ def open_recording(path: Path | str) -> LaneRecording:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     written = [cv2.imwrite(f"{folder}/{i}.png", np.full((4, 6), i, np.uint8)) for i in (9, 10)]
         ...     frames = list(open_recording(folder))
-        >>> [frame.name for frame in frames], frames[0].grey.shape
+        >>> [frame.name for frame in frames], frames[0].gray.shape
         (['9.png', '10.png'], (4, 6))
     """
     path = Path(path)
@@ -119,7 +119,7 @@ def open_recording(path: Path | str) -> LaneRecording:
         return _probe_video(path)
     files = _pictures(path) if path.is_dir() else (path,)
     if not files:
-        raise DataError(path, "has no pictures: png, jpg, bmp, tif, pgm, ppm and webp are read")
+        raise DataError(path, "has no images: png, jpg, bmp, tif, pgm, ppm and webp are read")
     shape = _read_picture(files[0]).shape[:2]
     return LaneRecording(path, files, None, shape, len(files))
 
@@ -144,7 +144,7 @@ def _read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     with _quiet(cv2):
         color = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     if color is None:
-        raise DataError(path, "is no picture that can be read")
+        raise DataError(path, "is no image that can be read")
     return color
 
 
@@ -185,7 +185,7 @@ def _quiet(cv2: ModuleType) -> Iterator[None]:
         logging.setLogLevel(level)
 
 
-def _grey(color: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+def _gray(color: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
     return 0.5 * (color[..., 1].astype(np.float32) + color[..., 2])
 
 

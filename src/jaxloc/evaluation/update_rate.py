@@ -1,8 +1,8 @@
-"""How often to register pictures to each other: random error rewards seldom, systematic error rewards often.
+"""How often to register images to each other: random error rewards seldom, systematic error rewards often.
 
 Over a way L with an update every d there are L / d updates. Each brings a random error of standard deviation sigma,
 independent of the others: together ``sqrt(sigma^2 L / d)``. Each also brings a systematic error, and if that grows with
-the *square* of the displacement, ``k d^2`` (pictures that overlap less and lie further from the middle of the lens),
+the *square* of the displacement, ``k d^2`` (images that overlap less and lie further from the middle of the lens),
 the errors add up to ``(L / d) k d^2 = k L d``. (Were it proportional to d, the sum would not depend on d at all.)
 
 Kelly's curve is the *plain sum* of both, a spread beside an offset; the root mean square over many drives is their sum

@@ -21,7 +21,7 @@ def intensity_centroid(image: Float[Array, "h w"], uv: Float[Array, "n 2"], *, r
     """Direction from a corner to the centroid of the brightness around it, ``atan2(m01, m10)``.
 
     Args:
-        image: grey levels; continued by its border.
+        image: gray levels; continued by its border.
         uv: places; read at the nearest pixels.
         radius: of the disc, px; static.
 
@@ -97,7 +97,7 @@ def compare(image: Float[Array, "h w"], keypoints: Keypoints, tests: Int[Array, 
     Places are means of 5 x 5 pixels at the nearest pixel.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         keypoints: with `uv` and `angle`.
         tests: from `draw_tests` or `select_tests`.
 
@@ -134,12 +134,12 @@ def brief(image: Float[Array, "h w"], keypoints: Keypoints, tests: Int[Array, "t
     """Bits of all tests, packed as OpenCV packs them, the first in the lowest bit.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         keypoints: with `uv` and `angle`.
         tests: a multiple of eight.
 
     Returns:
-        A byte for eight tests; not valid where a test leaves the picture.
+        A byte for eight tests; not valid where a test leaves the image.
 
     Raises:
         ValueError: The number of tests is no multiple of eight.

@@ -26,11 +26,11 @@ def segment_score(image: Float[Array, "h w"], *, arc: int = 9) -> Float[Array, "
     of one sign; it is differentiable almost everywhere.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         arc: pixels in a row, 9 to 12 as a rule; static.
 
     Returns:
-        Grey levels; zero where no arc is brighter or darker, and within three pixels of the border. For whole grey
+        Gray levels; zero where no arc is brighter or darker, and within three pixels of the border. For whole gray
         levels, OpenCV's score is one less: the last whole threshold passed.
 
     Raises:
@@ -97,8 +97,8 @@ def fast(
     """FAST corners: segment test, and no other corner with as high a score next to it.
 
     Args:
-        image: grey levels.
-        threshold: least difference between a corner and its arc, grey levels.
+        image: gray levels.
+        threshold: least difference between a corner and its arc, gray levels.
         arc: pixels in a row, 9 (FAST-9) to 12 (FAST-12); static.
         capacity: keypoints that are kept, the highest scores first.
 

@@ -54,7 +54,7 @@ class StructureTensor(eqx.Module):
     """The symmetric matrix `M = mean [[Iu Iu, Iu Iv], [Iu Iv, Iv Iv]]` of every pixel.
 
     Attributes:
-        uu: Mean squared derivative along rows, (grey levels / px)^2.
+        uu: Mean squared derivative along rows, (gray levels / px)^2.
         uv: Mean product of both derivatives.
         vv: Mean squared derivative along columns.
     """
@@ -83,7 +83,7 @@ def structure_tensor(image: Float[Array, "h w"], *, window: AbstractWindow | Non
     `E(d) = d^T M d` approximates the mean squared change of the window under a small displacement `d`.
 
     Args:
-        image: Grey image.
+        image: Gray image.
         window: `Box()` (the default, 3x3) or `GaussianWindow()`.
 
     Returns:
@@ -111,7 +111,7 @@ def harris(
     """Harris's corner response `R = det M - k (tr M)^2`.
 
     Args:
-        image: Grey image.
+        image: Gray image.
         k: Weight of the trace, 0.04 to 0.15.
         window: `Box()` (the default, 3x3) or `GaussianWindow()`.
 
@@ -143,7 +143,7 @@ def shi_tomasi(image: Float[Array, "h w"], *, window: AbstractWindow | None = No
     """The smaller eigenvalue of M, `(uu + vv) / 2 - sqrt(((uu - vv) / 2)^2 + uv^2)`.
 
     Args:
-        image: Grey image.
+        image: Gray image.
         window: `Box()` (the default, 3x3) or `GaussianWindow()`.
 
     Returns:

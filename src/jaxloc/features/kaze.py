@@ -63,7 +63,7 @@ def kaze(image: Float[Array, "h w"], *, options: Kaze = Kaze(), capacity: int = 
     degrees.
 
     Args:
-        image: grey levels 0-255.
+        image: gray levels 0-255.
         options: what to look for; `Kaze.accelerated()` is A-KAZE.
         capacity: keypoints that are kept, the strongest first.
 
@@ -94,7 +94,7 @@ def describe_kaze(image: Float[Array, "h w"], keypoints: Keypoints, *, options: 
     """Descriptors of any keypoints with a size and an angle, read from the nonlinear scale space.
 
     Args:
-        image: grey levels 0-255.
+        image: gray levels 0-255.
         keypoints: `size` is twice the reach of derivatives.
         options: the scale space and the descriptors.
 
@@ -114,13 +114,13 @@ def describe_kaze(image: Float[Array, "h w"], keypoints: Keypoints, *, options: 
 def _strongest(found: tuple[Stack, ...], options: Kaze, capacity: int) -> Keypoints:
     """The strongest maxima of the determinants of all stacks."""
     scales, shape, parts = options.scales, found[0].layers.shape[1:], []
-    # A ridge of the determinant is no edge of the picture.
+    # A ridge of the determinant is no edge of the image.
     test = ExtremumTest(255.0**2 * options.least_response, edge_ratio=1e6, minima=False, flat=options.flat)
     for stack in found:
         blobs = find_extrema(stack.determinant, test, capacity=_SURPLUS * capacity)
         sigma = scales.sigma * stack.step * jnp.exp2(blobs.place[:, 0] / scales.layers)
         uv = stack.step * blobs.place[:, :0:-1]
-        # What its second derivatives reach lies within the picture: large blobs at the border are seldom found again.
+        # What its second derivatives reach lies within the image: large blobs at the border are seldom found again.
         far = jnp.asarray([shape[1] - 1, shape[0] - 1], uv.dtype)[None, :]
         room = jnp.min(jnp.minimum(uv, far - uv), axis=1)
         parts.append((uv, sigma, blobs.value, blobs.valid & (room >= 2.0 * scales.reach * sigma)))

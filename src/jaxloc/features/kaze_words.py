@@ -22,11 +22,11 @@ class Words(eqx.Module):
 
     @abstractmethod
     def of(self, values: Float[Array, "n k 3"], inside: Bool[Array, "n k"], angle: Float[Array, " n"]) -> Array:
-        """Descriptors of grey levels and derivatives on a grid of ``side x side``, turned with the keypoint.
+        """Descriptors of gray levels and derivatives on a grid of ``side x side``, turned with the keypoint.
 
         Args:
-            values: grey level, derivative along rows and along columns of the picture.
-            inside: which samples lie inside of the picture.
+            values: gray level, derivative along rows and along columns of the image.
+            inside: which samples lie inside of the image.
             angle: of the keypoint, rad.
         """
 
@@ -65,7 +65,7 @@ class MSurf(Words):
 
 
 class MLdb(Words):
-    """Comparisons of mean grey level and mean derivatives of all pairs of cells of three grids: 486 bits in 61 bytes.
+    """Comparisons of mean gray level and mean derivatives of all pairs of cells of three grids: 486 bits in 61 bytes.
 
     ``(6 + 36 + 120) pairs x 3 channels``; cells whose border cuts a sample share it.
 

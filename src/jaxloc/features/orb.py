@@ -18,9 +18,9 @@ class Orb(eqx.Module):
     """What ORB looks for.
 
     Attributes:
-        levels: levels of the pyramid; as many as the picture has room for.
+        levels: levels of the pyramid; as many as the image has room for.
         factor: ratio of neighboring levels.
-        threshold: least contrast of a corner, grey levels.
+        threshold: least contrast of a corner, gray levels.
         harris_k: weight of the trace in Harris's response, by which corners are ranked.
 
     References:
@@ -49,7 +49,7 @@ def orb(
     """Oriented FAST corners of all levels and their bits.
 
     Args:
-        image: grey levels 0-255.
+        image: gray levels 0-255.
         options: what to look for.
         tests: pairs that are compared; drawn with a fixed key by default, so that descriptors of two calls agree.
         capacity: keypoints in all; levels share it by their areas' roots.
@@ -101,7 +101,7 @@ def _ranked(image: Array, corners: Keypoints, options: Orb, capacity: int) -> Ke
 def _of_level(
     image: Array, options: Orb, tests: Array, level: int, whole: tuple[int, ...], capacity: int
 ) -> tuple[Keypoints, Descriptors]:
-    """Keypoints of a level, in pixels of the whole picture."""
+    """Keypoints of a level, in pixels of the whole image."""
     margin = SIDE // 2 + 1
     score = segment_score(image)
     corner = thin_out(jnp.where(score > options.threshold, score, 0.0))
@@ -113,7 +113,7 @@ def _of_level(
     found = eqx.tree_at(lambda k: k.angle, found, angle)
     words = brief(image, found, tests)
     ratio = jnp.asarray([whole[1] / image.shape[1], whole[0] / image.shape[0]], image.dtype)
-    # Pixels are squares: the corner of the picture stays where it is, not the center of its first pixel.
+    # Pixels are squares: the corner of the image stays where it is, not the center of its first pixel.
     uv = jnp.where(words.valid[:, None], (found.uv + 0.5) * ratio[None, :] - 0.5, 0.0)
     size = jnp.where(words.valid, jnp.asarray(SIDE * options.factor**level, image.dtype), 0.0)
     octave = jnp.where(words.valid, jnp.full_like(found.octave, level), 0)

@@ -1,7 +1,7 @@
 """SIFT in JAX: blobs over scale, their orientations, and descriptors of 128 numbers, all differentiable.
 
 OpenCV's SIFT (`images.detect` with ``SIFT()``) is several times as fast on a CPU; this one runs on accelerators and in
-batches, and has derivatives: of places and scales by the interpolated extrema, of descriptors by the picture.
+batches, and has derivatives: of places and scales by the interpolated extrema, of descriptors by the image.
 """
 
 import math
@@ -30,7 +30,7 @@ class Sift(eqx.Module):
 
     Attributes:
         scales: the scale space.
-        least_contrast: least response of a keypoint times the layers of an octave, as a share of 255 grey levels.
+        least_contrast: least response of a keypoint times the layers of an octave, as a share of 255 gray levels.
         edge_ratio: greatest ratio of principal curvatures.
         orientations: directions that a keypoint may have; each fills a slot of its own.
         second_peak: share of the highest peak that another one needs.
@@ -50,11 +50,11 @@ class _Slopes(NamedTuple):
     """Derivatives of all layers of all octaves, one after the other, and where each layer lies.
 
     Attributes:
-        right: central differences along rows, grey levels a pixel of the octave.
+        right: central differences along rows, gray levels a pixel of the octave.
         down: along columns.
         start: first entry of each (octave, layer).
         shape: (rows, columns) of each octave.
-        step: of each octave, px of the picture.
+        step: of each octave, px of the image.
     """
 
     right: Float[Array, " m"]
@@ -69,7 +69,7 @@ def sift(image: Float[Array, "h w"], *, options: Sift = Sift(), capacity: int = 
     """Keypoints with scale and orientation, and their descriptors.
 
     Args:
-        image: grey levels 0-255.
+        image: gray levels 0-255.
         options: what to look for.
         capacity: keypoints that are kept, the strongest first; there are ``options.orientations`` slots for each.
 
@@ -113,8 +113,8 @@ def describe_sift(
     directions, every sample shared among its neighbors, under a Gaussian window.
 
     Args:
-        image: grey levels.
-        keypoints: `size` is twice the blur at which the picture is read.
+        image: gray levels.
+        keypoints: `size` is twice the blur at which the image is read.
         scales: the scale space.
 
     Returns:

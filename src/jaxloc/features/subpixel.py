@@ -16,7 +16,7 @@ class RefinedColumns(eqx.Module):
     Attributes:
         uv: Refined pixels in the right image, in the row of the left point; the guess where not ok (zero if that is off
             the image).
-        residual: Root mean square of the grey-level difference that gain and bias leave.
+        residual: Root mean square of the gray-level difference that gain and bias leave.
         variance: Variance of the column, px^2.
         correlation: Normalized correlation of both patches, -1 to 1.
         ok: True where the refinement may be trusted.
@@ -34,7 +34,7 @@ class RefinedPoints(eqx.Module):
 
     Attributes:
         uv: Refined pixels in the second image; the guess where not ok (zero if that is off the image).
-        residual: Root mean square of the grey-level difference that gain and bias leave.
+        residual: Root mean square of the gray-level difference that gain and bias leave.
         covariance: Covariance of `uv`, px^2.
         correlation: Normalized correlation of both patches, -1 to 1.
         ok: True where the refinement may be trusted.
@@ -83,7 +83,7 @@ def refine_stereo(
     implicit function theorem; the guess has none.
 
     Args:
-        left: Left image, grey levels.
+        left: Left image, gray levels.
         right: Right image, of the same rectified pair.
         uv_left: Pixels in the left image.
         uv_right: Guesses in the right image, within `options.reach` px of the truth; only their columns are used.
@@ -123,7 +123,7 @@ def refine_translation(
     none.
 
     Args:
-        previous: First image, grey levels.
+        previous: First image, gray levels.
         current: Second image.
         uv_previous: Pixels in the first image.
         uv_current: Guesses in the second image, within `options.reach` px of the truth.

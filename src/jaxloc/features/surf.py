@@ -30,7 +30,7 @@ class Surf(eqx.Module):
     """What SURF looks for.
 
     Attributes:
-        octaves: most octaves; as many as the picture has room for.
+        octaves: most octaves; as many as the image has room for.
         least_response: least determinant of a keypoint, as a share of 255^2.
         upright: all keypoints point to the right: for cameras that do not roll.
     """
@@ -45,7 +45,7 @@ def surf(image: Float[Array, "h w"], *, options: Surf = Surf(), capacity: int = 
     """Keypoints with scale, orientation and sign of the Laplacian, and their descriptors.
 
     Args:
-        image: grey levels 0-255.
+        image: gray levels 0-255.
         options: what to look for.
         capacity: keypoints that are kept, the strongest first.
 
@@ -83,7 +83,7 @@ def describe_surf(image: Float[Array, "h w"], keypoints: Keypoints) -> Descripto
     4 x 4 cells: ``sum d_u, sum d_v, sum |d_u|, sum |d_v|``.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         keypoints: `size` is 7.5 times the scale, the distance of two samples.
 
     Returns:
@@ -133,7 +133,7 @@ def _strongest(image: Array, options: Surf, capacity: int) -> tuple[Array, Array
     least, parts = 255.0**2 * options.least_response, []
     for octave in range(octaves_that_fit(image.shape, options.octaves)):
         found = box_hessian(image, octave=octave)
-        # The largest filter lies within the picture; a ridge of the determinant is no edge of the picture.
+        # The largest filter lies within the image; a ridge of the determinant is no edge of the image.
         sizes = filter_sizes(octave)
         border = sizes[-1] // (2 * found.step) + 1
         test = ExtremumTest(least, edge_ratio=1e6, border=border, minima=False)
@@ -178,7 +178,7 @@ def _describe(image: Array, keypoints: Keypoints) -> Descriptors:
 
 
 def _haar(image: Array, u: Float[Array, "n k"], v: Float[Array, "n k"], half: Float[Array, " n"]) -> tuple:
-    """Differences of the right and left, lower and upper half of a square; zero where it leaves the picture.
+    """Differences of the right and left, lower and upper half of a square; zero where it leaves the image.
 
     The square is a whole number of pixels wide and lies between pixels: it is exact on whole pixels and linear between.
     """

@@ -1,6 +1,6 @@
 """Nonlinear diffusion: smoothing that stops at edges, by fast explicit and by additive implicit steps.
 
-``dL/dt = div(g(|grad L_s|) grad L)`` with a conductivity g that falls where the picture, itself smoothed a little, is
+``dL/dt = div(g(|grad L_s|) grad L)`` with a conductivity g that falls where the image, itself smoothed a little, is
 steep. Time t smooths flat parts like a Gaussian of variance ``2 t``. It is the scale space of KAZE and A-KAZE.
 
 References:
@@ -70,15 +70,15 @@ _PERONA_MALIK = PeronaMalik()
 def contrast(
     image: Float[Array, "h w"], *, percentile: float | Float[Array, ""] = 70.0, sigma: float = 1.0
 ) -> Float[Array, ""]:
-    """The gradient that divides edges from noise: a percentile of those of the smoothed picture.
+    """The gradient that divides edges from noise: a percentile of those of the smoothed image.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         percentile: of the gradients that are not zero.
         sigma: blur before the derivative, px; static.
 
     Returns:
-        Grey levels a pixel; one for a flat picture.
+        Gray levels a pixel; one for a flat image.
 
     References:
         Alcantarilla et al. 2012, section 2.1.
@@ -109,8 +109,8 @@ def conductance(
     """Conductivity of every pixel, ``g(|grad L_s|^2 / k^2)``.
 
     Args:
-        image: grey levels.
-        contrast: k, grey levels a pixel.
+        image: gray levels.
+        contrast: k, gray levels a pixel.
         kind: the function g.
         sigma: blur before the derivative, px; static.
 
@@ -180,7 +180,7 @@ def diffuse_explicit(
     """Explicit steps ``L <- L + tau div(g grad L)`` with fixed conductivities.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         conductance: of each pixel, at most one.
         steps: sizes; at most `LARGEST_STEP`, or those of `fed_steps`.
 
@@ -203,7 +203,7 @@ def diffuse_implicit(
     Each axis is a tridiagonal system, solved along it for all lines at once. Any size of the step is stable.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         conductance: of each pixel, not negative.
         step: diffusion time.
 
@@ -251,13 +251,13 @@ def diffuse(
     """Smooths flat parts like a Gaussian of deviation sigma and keeps edges, by cycles of fast explicit diffusion.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         sigma: deviation of the Gaussian that would smooth flat parts as much, px; static.
         kind: conductivity.
         cycles: times that the conductivity is computed; static.
 
     Returns:
-        The smoothed picture. Derivatives flow through the steps, not through the contrast.
+        The smoothed image. Derivatives flow through the steps, not through the contrast.
 
     References:
         Alcantarilla, Nuevo, Bartoli, "Fast explicit diffusion for accelerated features in nonlinear scale spaces",

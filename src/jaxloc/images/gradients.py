@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 
 class ImageGradient(eqx.Module):
-    """First derivatives of an image in grey levels a pixel.
+    """First derivatives of an image in gray levels a pixel.
 
     Attributes:
         right: Derivative along a row, dI/du.
@@ -24,10 +24,10 @@ def central_difference(image: Float[Array, "h w"]) -> ImageGradient:
     """Differentiates by `(I[x + 1] - I[x - 1]) / 2`.
 
     Args:
-        image: Grey image.
+        image: Gray image.
 
     Returns:
-        Both derivatives, in grey levels a pixel; zero across the reflected border.
+        Both derivatives, in gray levels a pixel; zero across the reflected border.
 
     Example:
         >>> import jax.numpy as jnp
@@ -40,10 +40,10 @@ def central_difference(image: Float[Array, "h w"]) -> ImageGradient:
 
 @eqx.filter_jit
 def sobel(image: Float[Array, "h w"]) -> ImageGradient:
-    """Differentiates with Sobel's 3x3 kernel, scaled to grey levels a pixel: `cv2.Sobel(ksize=3) / 8`.
+    """Differentiates with Sobel's 3x3 kernel, scaled to gray levels a pixel: `cv2.Sobel(ksize=3) / 8`.
 
     Args:
-        image: Grey image.
+        image: Gray image.
 
     Returns:
         Both derivatives.
@@ -59,10 +59,10 @@ def sobel(image: Float[Array, "h w"]) -> ImageGradient:
 
 @eqx.filter_jit
 def scharr(image: Float[Array, "h w"]) -> ImageGradient:
-    """Differentiates with Scharr's 3x3 kernel, scaled to grey levels a pixel: `cv2.Scharr / 32`.
+    """Differentiates with Scharr's 3x3 kernel, scaled to gray levels a pixel: `cv2.Scharr / 32`.
 
     Args:
-        image: Grey image.
+        image: Gray image.
 
     Returns:
         Both derivatives; their direction depends less on orientation than Sobel's.
@@ -86,7 +86,7 @@ def smooth(
     """Smooths with a Gaussian, cut at `radius` pixels and normalized: `cv2.GaussianBlur` of size `2 radius + 1`.
 
     Args:
-        image: Grey image.
+        image: Gray image.
         sigma: Standard deviation in pixels. A Python number fixes it at trace time, an array can be differentiated.
         radius: Static reach of the kernel; three sigma by default, needed when `sigma` is an array.
 

@@ -16,10 +16,10 @@ def integral(image: Num[Array, "h w"]) -> Num[Array, "h1 w1"]:
     Sums of integers wrap around; differences of them are exact nevertheless, as long as the sum over a box fits.
 
     Args:
-        image: grey levels; small integers are summed as int32.
+        image: gray levels; small integers are summed as int32.
 
     Returns:
-        One row and one column more than the picture, the first of each zero.
+        One row and one column more than the image, the first of each zero.
 
     References:
         Crow, "Summed-area tables for texture mapping", SIGGRAPH 1984; thesis eq. 2.37 [T-36].
@@ -42,10 +42,10 @@ def box_sums(sums: Num[Array, "h1 w1"], boxes: Int[Array, "n 4"]) -> Num[Array, 
     Args:
         sums: an integral image.
         boxes: (top, left, bottom, right): rows from top to bottom - 1, columns from left to right - 1. What lies
-            outside of the picture counts as zero, and so does an empty box.
+            outside of the image counts as zero, and so does an empty box.
 
     Returns:
-        The sums: exact for integers, else to the rounding of the whole picture's sum.
+        The sums: exact for integers, else to the rounding of the whole image's sum.
 
     References:
         Viola and Jones, CVPR 2001; thesis eq. 2.37 [T-36].
@@ -67,19 +67,19 @@ def box_sums(sums: Num[Array, "h1 w1"], boxes: Int[Array, "n 4"]) -> Num[Array, 
 def filter_boxes(
     linear: Callable[..., tuple[Array, ...]], largest: int, image: Float[Array, "h w"], *places: Array
 ) -> tuple[Array, ...]:
-    """Box filters of a picture of float32, without the rounding of sums over millions of pixels.
+    """Box filters of an image of float32, without the rounding of sums over millions of pixels.
 
-    Grey levels become integers of a fixed point as fine as the largest filter allows: sums of those are exact modulo
-    2^32. A picture of float64 is summed as it is. Derivatives follow the filter, which is linear.
+    Gray levels become integers of a fixed point as fine as the largest filter allows: sums of those are exact modulo
+    2^32. An image of float64 is summed as it is. Derivatives follow the filter, which is linear.
 
     Args:
         linear: from an integral image and the places to sums of boxes; adds and subtracts only, in any dtype. Static.
         largest: greatest sum of absolute weights of a filter, pixels; static.
-        image: grey levels.
+        image: gray levels.
         places: further arguments of `linear`.
 
     Returns:
-        What `linear` returns, in the picture's dtype.
+        What `linear` returns, in the image's dtype.
 
     Example:
         >>> import jax.numpy as jnp
@@ -91,7 +91,7 @@ def filter_boxes(
     if image.dtype == jnp.float64:
         return linear(integral(image), *places)
     highest = jnp.maximum(jnp.max(jnp.abs(image)), jnp.asarray(1e-20, image.dtype))
-    # A power of two: whole grey levels stay exact.
+    # A power of two: whole gray levels stay exact.
     scale = jnp.exp2(jnp.floor(jnp.log2((2.0**31 - 1.0) / largest / highest)) - 1.0)
     whole = jnp.round(image * scale).astype(jnp.int32)
     return tuple(part.astype(image.dtype) / scale for part in linear(integral(whole), *places))

@@ -74,7 +74,7 @@ def sample(
     A point outside the image (or not finite) gives zero, is flagged, and has no gradient.
 
     Args:
-        image: Grey image, or one with any channels behind rows and columns (color, range, ...).
+        image: Gray image, or one with any channels behind rows and columns (color, range, ...).
         uv: Pixel coordinates (right, down), centers at integers.
         method: `Bilinear()` (the default) or `Bicubic()`.
 

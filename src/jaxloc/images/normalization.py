@@ -1,4 +1,4 @@
-"""Grey levels made comparable between pictures: exposure taken out before pixels are subtracted [K-22]."""
+"""Gray levels made comparable between images: exposure taken out before pixels are subtracted [K-22]."""
 
 from typing import Any
 
@@ -10,11 +10,11 @@ from jaxloc.images.gradients import convolve_columns, convolve_rows, pad_reflect
 
 
 class GainBias(eqx.Module):
-    """How one picture's grey levels follow from another's: ``image = gain * reference + bias``.
+    """How one image's gray levels follow from another's: ``image = gain * reference + bias``.
 
     Attributes:
         gain: contrast, 1 where the reference is flat.
-        bias: grey levels.
+        bias: gray levels.
         ok: False where the reference is flat or nothing is valid.
     """
 
@@ -23,17 +23,17 @@ class GainBias(eqx.Module):
     ok: Bool[Array, ""]
 
 
-def as_grey(image: Num[Array, "h w"] | Any, dtype: Any = None) -> Float[Array, "h w"]:
-    """Grey levels as floating numbers: bytes and other integers keep their values.
+def as_gray(image: Num[Array, "h w"] | Any, dtype: Any = None) -> Float[Array, "h w"]:
+    """Gray levels as floating numbers: bytes and other integers keep their values.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> as_grey(jnp.array([[200]], jnp.uint8)).tolist()
+        >>> as_gray(jnp.array([[200]], jnp.uint8)).tolist()
         [[200.0]]
     """
     image = jnp.asarray(image)
     if image.ndim != 2:
-        raise ValueError(f"A grey image has two axes (rows, columns); got an array of shape {image.shape}.")
+        raise ValueError(f"A gray image has two axes (rows, columns); got an array of shape {image.shape}.")
     if dtype is None:
         dtype = image.dtype if jnp.issubdtype(image.dtype, jnp.floating) else jnp.result_type(float)
     return image.astype(dtype)
@@ -44,7 +44,7 @@ def standardize(image: Float[Array, "h w"], *, valid: Bool[Array, "h w"] | None 
     """Zero mean and unit variance over the valid pixels: the same for ``I`` and ``a I + b``, a > 0.
 
     Args:
-        image: grey image.
+        image: gray image.
         valid: pixels that count; others, and pixels that are not finite, come out as zero.
 
     Returns:
@@ -68,9 +68,9 @@ def standardize_locally(image: Float[Array, "h w"], *, radius: int = 8, floor: f
     """Zero mean and unit variance over a square around every pixel: what is left of shading and local contrast.
 
     Args:
-        image: grey image.
+        image: gray image.
         radius: half the side of the square, px.
-        floor: standard deviation of noise, grey levels, which keeps flat places from being blown up.
+        floor: standard deviation of noise, gray levels, which keeps flat places from being blown up.
 
     Returns:
         ``(I - mean) / sqrt(variance + floor^2)``.
@@ -96,11 +96,11 @@ def standardize_locally(image: Float[Array, "h w"], *, radius: int = 8, floor: f
 def fit_gain_bias(
     image: Float[Array, "h w"], reference: Float[Array, "h w"], *, valid: Bool[Array, "h w"] | None = None
 ) -> GainBias:
-    """Least-squares gain and bias between two aligned pictures.
+    """Least-squares gain and bias between two aligned images.
 
     Args:
-        image: grey image.
-        reference: picture of the same place.
+        image: gray image.
+        reference: image of the same place.
         valid: pixels that count.
 
     Returns:
@@ -127,10 +127,10 @@ def fit_gain_bias(
 
 @eqx.filter_jit
 def rank_transform(image: Float[Array, "h w"], *, radius: int = 3) -> Float[Array, "h w"]:
-    """Share of the neighbors in a square that are darker than each pixel: no increasing map of grey levels changes it.
+    """Share of the neighbors in a square that are darker than each pixel: no increasing map of gray levels changes it.
 
     Args:
-        image: grey image; borders are reflected.
+        image: gray image; borders are reflected.
         radius: half the side of the square, px.
 
     Returns:

@@ -36,7 +36,7 @@ def extract(
     image at `uv + (j - (q - 1) / 2, i - (p - 1) / 2)`; the values equal those of `interpolation.sample`.
 
     Args:
-        image: Grey image.
+        image: Gray image.
         uv: Patch centers, pixel coordinates (right, down).
         size: Static side of the patch in pixels, or (rows, columns); odd sizes have a pixel at their center.
         method: `Bilinear()` (the default) or `Bicubic()`.

@@ -16,7 +16,7 @@ def halve(image: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
     The kept pixels are the even ones, so that the center of pixel `uv` lands on `uv / 2`.
 
     Args:
-        image: Grey image.
+        image: Gray image.
 
     Returns:
         An image of `ceil(h / 2)` rows and `ceil(w / 2)` columns.
@@ -37,7 +37,7 @@ def gaussian_pyramid(image: Float[Array, "h w"], *, levels: int) -> tuple[Float[
     """Builds the image at full, half, quarter, ... size.
 
     Args:
-        image: Grey image.
+        image: Gray image.
         levels: Static number of levels, the full image included.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Spectra of pictures: a window against their borders, and amplitudes, which no shift changes [R-33, R-34]."""
+"""Spectra of images: a window against their borders, and amplitudes, which no shift changes [R-33, R-34]."""
 
 import math
 from typing import Any
@@ -26,7 +26,7 @@ def amplitude(image: Float[Array, "h w"]) -> Float[Array, "h w"]:
     """Size of the Fourier coefficients, ``|fft2(image)|``: the same for all circular shifts.
 
     Args:
-        image: grey levels.
+        image: gray levels.
 
     Returns:
         Amplitudes in the order of `jnp.fft.fft2`, with finite derivatives also where they vanish.
@@ -78,7 +78,7 @@ class LogPolar(eqx.Module):
         safe = jnp.log(1.0 + jnp.fft.fftshift(amplitudes) / jnp.maximum(jnp.mean(amplitudes), 1e-6))
         read = sample(safe, jnp.stack([u.reshape(-1), v.reshape(-1)], axis=1), method=Bilinear())
         values = read.values.reshape(self.angles, self.radii)
-        # Spectra of pictures fall off alike in all directions: only what departs from that tells rotation or scale.
+        # Spectra of images fall off alike in all directions: only what departs from that tells rotation or scale.
         return values * (radius / self.highest)[None, :]
 
     def tapered(self, polar: Float[Array, "a r"]) -> Float[Array, "a r"]:
@@ -87,7 +87,7 @@ class LogPolar(eqx.Module):
         return (polar - jnp.mean(polar, axis=0)[None, :]) * fade[None, :]
 
     def turn(self, shift: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Angle (right to down) and logarithm of scale of a picture whose sampled spectrum moved by (radii, angles)."""
+        """Angle (right to down) and logarithm of scale of an image whose sampled spectrum moved by (radii, angles)."""
         return shift[::-1] * self.steps(shift.dtype) * jnp.array([1.0, -1.0], dtype=shift.dtype)
 
     def steps(self, dtype: Any = float) -> Float[Array, "2"]:

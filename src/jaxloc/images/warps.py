@@ -274,7 +274,7 @@ class Affine(Warp):
 
 
 class Homography(Warp):
-    """A map of the projective plane: how a plane of the world appears in two pictures. SL(3), determinant one.
+    """A map of the projective plane: how a plane of the world appears in two images. SL(3), determinant one.
 
     References:
         Benhimane and Malis, "Homography-based 2D visual tracking and servoing", 2007, for the group.

@@ -1,4 +1,4 @@
-"""The road from above: a picture sampled on a grid of the ground, of equal width at every range."""
+"""The road from above: an image sampled on a grid of the ground, of equal width at every range."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc.images.interpolation import Bilinear, sample_components
-from jaxloc.images.normalization import as_grey
+from jaxloc.images.normalization import as_gray
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.ground_camera import GroundCamera
 
@@ -28,7 +28,7 @@ class GroundGrid(eqx.Module):
 
     @staticmethod
     def between(near: Any, far: Any, width: Any, *, rows: int = 64, columns: int = 128) -> "GroundGrid":
-        """A grid whose rows are spaced evenly in log range, between how the picture and how the road would space them.
+        """A grid whose rows are spaced evenly in log range, between how the image and how the road would space them.
 
         Args:
             near: range of the first row, m.
@@ -80,11 +80,11 @@ class GroundGrid(eqx.Module):
 
 
 class GroundView(eqx.Module):
-    """A picture of the ground from above.
+    """An image of the ground from above.
 
     Attributes:
-        image: grey levels, row by range and column by lateral position; zero where nothing is seen.
-        seen: where the ground is in the picture.
+        image: gray levels, row by range and column by lateral position; zero where nothing is seen.
+        seen: where the ground is in the image.
         grid: where the samples lie.
         height: of the camera, m: it says how the ranges change with the pitch.
     """
@@ -137,16 +137,16 @@ def halve_columns(
 
 @eqx.filter_jit
 def look(ground: GroundCamera, image: Num[Array, "h w"], grid: GroundGrid) -> GroundView:
-    """Inverse perspective mapping: samples a picture where it shows the points of a grid on the ground.
+    """Inverse perspective mapping: samples an image where it shows the points of a grid on the ground.
 
     Args:
         ground: camera and its place over the road.
-        image: grey picture, bytes or floats.
+        image: gray image, bytes or floats.
         grid: points of the ground.
 
     Returns:
-        The view, smoothed along its rows; what lies outside the picture, or is not finite in it, is not seen.
-        Differentiable in the picture and in all numbers of the camera.
+        The view, smoothed along its rows; what lies outside the image, or is not finite in it, is not seen.
+        Differentiable in the image and in all numbers of the camera.
 
     References:
         [K-34], [K-35]; H. A. Mallot et al., "Inverse perspective mapping simplifies optical flow computation and
@@ -160,7 +160,7 @@ def look(ground: GroundCamera, image: Num[Array, "h w"], grid: GroundGrid) -> Gr
         >>> view.image.shape, bool(jnp.all(view.image[view.seen] == 7.0))
         ((64, 128), True)
     """
-    pixels = as_grey(image)
+    pixels = as_gray(image)
     # Twice as many columns, then halved: a mark is not much wider than a column, and would alias.
     quarter = 0.25 * grid.spacing
     fine = jnp.stack([grid.left + quarter, grid.left - quarter], axis=1).ravel()

@@ -12,12 +12,12 @@ from jaxtyping import Array, Bool, Float, Num
 from jaxloc.features import subpixel
 from jaxloc.features.opencv import library
 
-# Cost where a window leaves the other picture.
+# Cost where a window leaves the other image.
 _OUTSIDE = 1e9
 
 
 class DisparityMap(eqx.Module):
-    """Columns by which points of the left picture lie further left in the right one.
+    """Columns by which points of the left image lie further left in the right one.
 
     Attributes:
         disparity: px; zero where not valid.
@@ -36,18 +36,18 @@ class WindowCost(eqx.Module):
 
     @abstractmethod
     def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
-        """What is needed of a picture, once: arrays "... h w"."""
+        """What is needed of an image, once: arrays "... h w"."""
 
     @abstractmethod
     def compare(self, left: Any, right: Any, size: int) -> Float[Array, "h w"]:
-        """Cost of the windows around each pixel of two prepared pictures."""
+        """Cost of the windows around each pixel of two prepared images."""
 
 
 class SSD(WindowCost):
-    """Mean squared difference of grey levels [R-44]."""
+    """Mean squared difference of gray levels [R-44]."""
 
     def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
-        """The picture."""
+        """The image."""
         del size
         return image
 
@@ -60,13 +60,13 @@ class ZNCC(WindowCost):
     """One minus the normalized correlation: blind to gain and bias of a window [R-44].
 
     Attributes:
-        least_contrast: standard deviation below which a window has no texture, grey levels.
+        least_contrast: standard deviation below which a window has no texture, gray levels.
     """
 
     least_contrast: float = eqx.field(static=True, default=1.0)
 
     def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
-        """The picture about its mean, with the mean and the inverse deviation of each window."""
+        """The image about its mean, with the mean and the inverse deviation of each window."""
         centered = image - jnp.mean(image)
         mean = box_mean(centered, size)
         spread = box_mean(centered**2, size) - mean**2
@@ -133,7 +133,7 @@ class Matcher(eqx.Module):
 
     @abstractmethod
     def match(self, left: Num[Any, "h w"], right: Num[Any, "h w"]) -> DisparityMap:
-        """The disparity of each pixel of the left picture."""
+        """The disparity of each pixel of the left image."""
 
 
 class BlockMatching(Matcher):
@@ -180,7 +180,7 @@ class SemiGlobal(Matcher):
     sigma: float = eqx.field(static=True, default=0.25)
 
     def match(self, left: Num[Any, "h w"], right: Num[Any, "h w"]) -> DisparityMap:
-        """Runs OpenCV on 8-bit grey levels.
+        """Runs OpenCV on 8-bit gray levels.
 
         Raises:
             ImportError: OpenCV is not installed.
@@ -197,7 +197,7 @@ class SemiGlobal(Matcher):
             speckleWindowSize=100,
             speckleRange=2,
         )
-        found = matcher.compute(library.grey_bytes(left), library.grey_bytes(right)).astype(np.float32) / 16.0
+        found = matcher.compute(library.gray_bytes(left), library.gray_bytes(right)).astype(np.float32) / 16.0
         valid = found > 0
         variance = np.where(valid, self.sigma**2, 1.0).astype(np.float32)
         return DisparityMap(jnp.asarray(np.where(valid, found, 0.0)), jnp.asarray(variance), jnp.asarray(valid))
@@ -209,18 +209,18 @@ def match(
     *,
     matcher: Matcher = SemiGlobal(),  # noqa: B008 (an immutable record)
 ) -> DisparityMap:
-    """The disparity of each pixel of the left picture of a rectified pair.
+    """The disparity of each pixel of the left image of a rectified pair.
 
     Args:
-        left: left picture, grey levels.
-        right: right picture.
+        left: left image, gray levels.
+        right: right image.
         matcher: `SemiGlobal()` is OpenCV's, on the host; `BlockMatching()` is traced: `jit`, `vmap` and `grad` it.
 
     Returns:
         Disparities, their variance, and where they are valid.
 
     Raises:
-        ValueError: the pictures have not the same shape.
+        ValueError: the images have not the same shape.
 
     References:
         Review section 5.1 [R-44]; thesis section 2.1 [T-7].
@@ -235,7 +235,7 @@ def match(
         (True, 6.0)
     """
     if left.shape != right.shape:
-        raise ValueError(f"Pictures of a pair have one shape; these have {left.shape} and {right.shape}.")
+        raise ValueError(f"Images of a pair have one shape; these have {left.shape} and {right.shape}.")
     return matcher.match(left, right)
 
 
@@ -294,7 +294,7 @@ def _is_unique(costs: Array, best: Array, lowest: Array, margin: float) -> Bool[
 
 
 def _agrees(costs: Array, best: Array, tolerance: float) -> Bool[Array, "h w"]:
-    """Whether the right picture's pixel finds its way back."""
+    """Whether the right image's pixel finds its way back."""
     span, height, width = costs.shape
 
     def back(d: Any, carried: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -333,8 +333,8 @@ def refine(
     """Refines disparities to subpixels, with gain and bias of every window free: the steps of 1/16 px vanish.
 
     Args:
-        left: left picture, grey levels.
-        right: right picture.
+        left: left image, gray levels.
+        right: right image.
         found: disparities within a pixel of the truth.
         options: window, trust, and the greatest correction.
 

@@ -67,9 +67,9 @@ def homogeneous(points: Float[Array, "n 2"]) -> Float[Array, "3 n"]:
 
 @eqx.filter_jit
 def epipolar_lines(matrix: Float[Array, "3 3"], second: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
-    """Lines ``a u + b v + c = 0`` of the first picture on which points of the second lie; ``a^2 + b^2 = 1``.
+    """Lines ``a u + b v + c = 0`` of the first image on which points of the second lie; ``a^2 + b^2 = 1``.
 
-    For lines of the second picture give the transposed matrix and points of the first.
+    For lines of the second image give the transposed matrix and points of the first.
 
     References:
         Review eq. 20 [R-48]; thesis figure 2.3 [T-20].
@@ -87,13 +87,13 @@ def epipolar_lines(matrix: Float[Array, "3 3"], second: Float[Array, "n 2"]) -> 
 
 @eqx.filter_jit
 def epipoles(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Where each camera appears in the other's picture: unit homogeneous points with ``e1^T M = 0``, ``M e2 = 0``.
+    """Where each camera appears in the other's image: unit homogeneous points with ``e1^T M = 0``, ``M e2 = 0``.
 
     Args:
         matrix: fundamental or essential, of rank two.
 
     Returns:
-        The image of the second camera's center in the first picture, and that of the first's in the second.
+        The image of the second camera's center in the first image, and that of the first's in the second.
 
     References:
         Thesis figure 2.3 [T-20].
@@ -178,7 +178,7 @@ def sampson_distance(
 
     Args:
         matrix: fundamental (points in px) or essential (normalized coordinates).
-        first: points of the first picture.
+        first: points of the first image.
         second: their partners.
 
     References:
@@ -225,12 +225,12 @@ def epipolar_gate(
 
     Args:
         matrix: fundamental matrix.
-        first: keypoints of the first picture, px.
+        first: keypoints of the first image, px.
         second: keypoints of the second.
         band: greatest Sampson distance, px.
 
     Returns:
-        Which pairs may belong together: a search along a line instead of over the picture [R-46].
+        Which pairs may belong together: a search along a line instead of over the image [R-46].
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl

@@ -59,8 +59,8 @@ def eight_point(
     near one, then takes the nearest matrix of rank two. A good start; `two_view` refines.
 
     Args:
-        first: points of the first picture, px (or normalized coordinates: the essential matrix, nearly).
-        second: their partners in the second picture.
+        first: points of the first image, px (or normalized coordinates: the essential matrix, nearly).
+        second: their partners in the second image.
         weights: of each pair, one by default; pairs with weight zero do not count.
         valid: which pairs count; numbers that are not finite never do.
 
@@ -113,8 +113,8 @@ def seven_point(first: Float[Array, "7 2"], second: Float[Array, "7 2"]) -> Fund
     Seven equations leave ``F = c A + s B`` open; ``det F = 0`` is a cubic.
 
     Args:
-        first: points of the first picture, px.
-        second: their partners in the second picture.
+        first: points of the first image, px.
+        second: their partners in the second image.
 
     Returns:
         Three candidates of unit Frobenius norm; `valid` marks solutions. With derivatives; everything stays finite.

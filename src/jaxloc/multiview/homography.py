@@ -163,7 +163,7 @@ def _adjugate(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
 
 
 class TransferError(Problem):
-    """Corresponding points of a plane in two pictures, both with noise; the state is the `Homography`.
+    """Corresponding points of a plane in two images, both with noise; the state is the `Homography`.
 
     The error ``e = x2 - H(x1)`` has, to first order, the covariance ``s^2 (I + J J^T)`` with the derivative J of the
     map at ``x1``; it is whitened by that: Sampson's error.
@@ -171,7 +171,7 @@ class TransferError(Problem):
     Attributes:
         first: "2 n", px; finite everywhere.
         second: "2 n", px; finite everywhere.
-        sigma: standard deviation of a coordinate in either picture, px.
+        sigma: standard deviation of a coordinate in either image, px.
         valid: which count.
         loss: robust kernel over the two components.
 
@@ -240,16 +240,16 @@ def estimate_homography(
     hypotheses: int = 128,
     loss: Loss | None = None,
 ) -> Estimate:
-    """Homography between two pictures of a plane (or of a turning camera), among false correspondences.
+    """Homography between two images of a plane (or of a turning camera), among false correspondences.
 
     Samples of four points vote (MSAC on the whitened transfer error); the winner is refitted to its inliers and then
     refined on SL(3) under a robust kernel over all correspondences.
 
     Args:
-        first: points of the first picture, px.
+        first: points of the first image, px.
         second: their partners in the second, px.
         key: random key.
-        sigma: standard deviation of a coordinate in either picture, px.
+        sigma: standard deviation of a coordinate in either image, px.
         valid: which count; numbers that are not finite never do.
         hypotheses: number of samples; static.
         loss: kernel of the refinement, in sigmas; Tukey's of 95 % efficiency if None.

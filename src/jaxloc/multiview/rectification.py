@@ -1,4 +1,4 @@
-"""Two cameras turned, in their pictures, until rows show the same points; also two that nobody calibrated."""
+"""Two cameras turned, in their images, until rows show the same points; also two that nobody calibrated."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from jaxloc.solvers.cholesky import factor
 
 
 class Rectification(eqx.Module):
-    """How a pair of pictures becomes one of a `StereoRig`.
+    """How a pair of images becomes one of a `StereoRig`.
 
     Attributes:
         rig: the rectified pair.
@@ -34,13 +34,13 @@ def rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, *, shape: tuple[in
 
     The rotation between the cameras is shared, half each; then both turn by the smallest rotation that brings the
     baseline onto the x axis. The new camera has the mean of the focal lengths, and a principal point that puts the
-    middle of what both see into the middle of the picture.
+    middle of what both see into the middle of the image.
 
     Args:
         left: the left camera.
         right: the right camera.
         T_left_right: pose of the right camera in the left one's frame.
-        shape: (rows, columns) of the pictures.
+        shape: (rows, columns) of the images.
 
     Returns:
         The rotations and the rig, without lens.
@@ -76,19 +76,19 @@ def rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, *, shape: tuple[in
 
 @eqx.filter_jit
 def lookup(camera: Pinhole, rotation: SO3, target: Pinhole, *, shape: tuple[int, int]) -> Float[Array, "h w 2"]:
-    """Where each pixel of a rectified picture lies in the picture of the camera, lens included.
+    """Where each pixel of a rectified image lies in the image of the camera, lens included.
 
-    Reading the picture there (`jaxloc.images.interpolation.sample`, or ``cv2.remap`` with the two components) rectifies
+    Reading the image there (`jaxloc.images.interpolation.sample`, or ``cv2.remap`` with the two components) rectifies
     it. With the identity for a rotation, only the lens is taken out [K-81].
 
     Args:
-        camera: that took the picture.
+        camera: that took the image.
         rotation: from its frame to the rectified one.
         target: the rectified camera.
-        shape: (rows, columns) of the rectified picture.
+        shape: (rows, columns) of the rectified image.
 
     Returns:
-        Pixels (u, v); (-1, -1), outside any picture, where the camera does not look or its lens is not one-to-one.
+        Pixels (u, v); (-1, -1), outside any image, where the camera does not look or its lens is not one-to-one.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -108,12 +108,12 @@ def lookup(camera: Pinhole, rotation: SO3, target: Pinhole, *, shape: tuple[int,
 
 
 class RectifyingPair(eqx.Module):
-    """Maps of two pictures to a pair with equal rows.
+    """Maps of two images to a pair with equal rows.
 
     Attributes:
-        first: from pixels of the first picture to its rectified ones.
-        second: of the second picture.
-        ok: whether there are such maps: not when an epipole lies within the picture.
+        first: from pixels of the first image to its rectified ones.
+        second: of the second image.
+        ok: whether there are such maps: not when an epipole lies within the image.
     """
 
     first: Homography
@@ -130,16 +130,16 @@ def rectifying_homographies(
     shape: tuple[int, int],
     valid: Bool[Array, " n"] | None = None,
 ) -> RectifyingPair:
-    """Rectifies two pictures of which only the fundamental matrix is known.
+    """Rectifies two images of which only the fundamental matrix is known.
 
-    The map of the second picture sends its epipole to infinity along x and distorts its middle least; that of the
+    The map of the second image sends its epipole to infinity along x and distorts its middle least; that of the
     first makes rows equal and, by what is still free, corresponding columns as near as can be.
 
     Args:
         fundamental: F with ``x1^T F x2 = 0``, px.
-        first: points of the first picture, px.
+        first: points of the first image, px.
         second: their partners.
-        shape: (rows, columns) of the pictures.
+        shape: (rows, columns) of the images.
         valid: which pairs count.
 
     Returns:
@@ -182,7 +182,7 @@ def _unit(matrix: Array) -> Array:
 
 
 def _to_infinity(epipole: Float[Array, "3"], shape: tuple[int, int]) -> tuple[Float[Array, "3 3"], Bool[Array, ""]]:
-    """The map of a picture that sends a point to infinity along x, near the identity at the picture's middle."""
+    """The map of an image that sends a point to infinity along x, near the identity at the image's middle."""
     middle = jnp.asarray([0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1)], epipole.dtype)
     zero, one = jnp.zeros_like(epipole[0]), jnp.ones_like(epipole[0])
 
@@ -218,7 +218,7 @@ def _onto_x(axis: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def _shift(camera: Pinhole, rotation: SO3, focal: Float[Array, ""], shape: tuple[int, int]) -> Float[Array, "2"]:
-    """Principal point that brings the mean of some rays of a camera to the center of the rectified picture."""
+    """Principal point that brings the mean of some rays of a camera to the center of the rectified image."""
     rows, columns = shape
     parts = jnp.asarray([0.25, 0.5, 0.75], camera.fx.dtype)
     u, v = jnp.meshgrid(parts * (columns - 1), parts * (rows - 1))

@@ -64,8 +64,8 @@ def correct_pair(
     the corrected rays is the optimal point of two views.
 
     Args:
-        first: in the first picture: px, or coordinates normalized alike in both pictures.
-        second: in the second picture.
+        first: in the first image: px, or coordinates normalized alike in both images.
+        second: in the second image.
         matrix: fundamental (px) or essential matrix with ``x1^T M x2 = 0``.
 
     Returns:
@@ -104,10 +104,10 @@ class TriangulationProblem(Problem):
     """Pixels of one point in several cameras; the state is the point, world frame.
 
     Attributes:
-        camera: of all pictures.
+        camera: of all images.
         poses: ``T_world_camera``, a stack.
         pixels: "2 n"; finite everywhere.
-        sigma: standard deviation of a pixel coordinate, one a picture, px.
+        sigma: standard deviation of a pixel coordinate, one an image, px.
         valid: which count.
         loss: robust kernel over the two coordinates.
     """
@@ -157,16 +157,16 @@ def triangulate(
     """The point that a camera saw from several places: the minimum of the reprojection errors.
 
     Args:
-        camera: of all pictures; for different ones give normalized coordinates, ``Pinhole(1, 1, 0, 0)``, and a sigma
+        camera: of all images; for different ones give normalized coordinates, ``Pinhole(1, 1, 0, 0)``, and a sigma
             for each.
         poses: ``T_world_camera``, a stack of n.
         pixels: where the point was seen, px.
-        sigma: standard deviation of a pixel coordinate, px: a number or one a picture.
-        valid: which pictures count; numbers that are not finite never do.
-        loss: robust kernel over the two coordinates of a picture.
+        sigma: standard deviation of a pixel coordinate, px: a number or one an image.
+        valid: which images count; numbers that are not finite never do.
+        loss: robust kernel over the two coordinates of an image.
 
     Returns:
-        Estimate of the point, world frame, m. ``ok`` is False with fewer than two pictures, no baseline, or when the
+        Estimate of the point, world frame, m. ``ok`` is False with fewer than two images, no baseline, or when the
         point lies behind the cameras. With little parallax the covariance is large, and the density skewed in depth.
 
     References:

@@ -253,7 +253,7 @@ def _judged(fit: Estimate, pairs: _Pairs, before: Bool[Array, " n"], hypotheses:
     points = jnp.where(pairs.valid[None, :], pairs.first[:2], 0.0)
     mean = jnp.sum(points, axis=1, keepdims=True) / jnp.maximum(number, 1.0)
     spread = jnp.sum(jnp.where(pairs.valid[None, :], (points - mean) ** 2, 0.0)) / jnp.maximum(2.0 * number, 1.0)
-    # The share of the picture that lies in the band about an epipolar line: what agrees by chance.
+    # The share of the image that lies in the band about an epipolar line: what agrees by chance.
     chance = 2.0 * _GATE * pairs.sigma / jnp.sqrt(jnp.maximum(6.0 * spread, pairs.sigma**2))
     enough = count > 2.0 * _SAMPLE + 6.0 * jnp.minimum(chance, 1.0) * number
     # By the same count: a translation that nothing but false pairs and noise suggests is none.

@@ -41,7 +41,7 @@ class StereoFeatures(eqx.Module):
     """What a stereo frame shows: keypoints of the left image with their place in the right one.
 
     Attributes:
-        left: left image, grey levels.
+        left: left image, gray levels.
         right: right image.
         descriptors: of the left keypoints.
         measured: (u_left, u_right, v), px; finite also where no stereo match was found.
@@ -69,7 +69,7 @@ def match_stereo(
     """Finds the left keypoints in the right image and refines their columns to subpixels.
 
     Args:
-        left: left image, grey levels.
+        left: left image, gray levels.
         right: right image of the rectified pair.
         keypoints: of the left and of the right image.
         descriptors: of both.

@@ -32,7 +32,7 @@ class Config(eqx.Module):
         tangential: whether coefficients of decentering are looked for.
         fisheye: whether the lens is one.
         square_pixels: one focal length for rows and columns.
-        principal_point: whether it is looked for; otherwise it is the center of the pictures.
+        principal_point: whether it is looked for; otherwise it is the center of the images.
         robust: distance, in sigmas, from which a corner counts less; 0 for plain least squares.
     """
 
@@ -55,12 +55,12 @@ class Config(eqx.Module):
 
 
 class Views(eqx.Module):
-    """Pictures of a board.
+    """Images of a board.
 
     Attributes:
         board: corners in the frame of the board, m.
         corners: "boards corners 2", px; zero where the board was not found.
-        found: pictures in which it was.
+        found: images in which it was.
         shape: (rows, columns).
     """
 
@@ -77,7 +77,7 @@ class Side(eqx.Module):
         camera: the camera.
         parameters: its numbers, with covariance.
         errors: predicted minus measured corners, px; zero where the board was not found.
-        board_rms: of each picture, px; zero where the board was not found.
+        board_rms: of each image, px; zero where the board was not found.
         rms: of all, px.
     """
 
@@ -113,17 +113,17 @@ def run(views: tuple[Views, ...], config: Config = Config()) -> Result:
     """Calibrates one camera, or two that are fixed to each other, in float64 whatever JAX's default is.
 
     Args:
-        views: of the camera; or of the left and of the right camera, picture by picture at the same instants.
+        views: of the camera; or of the left and of the right camera, image by image at the same instants.
         config: what is looked for.
 
     Returns:
         The calibration.
 
     Raises:
-        ValueError: if there are not one or two cameras, or two with different numbers of pictures.
+        ValueError: if there are not one or two cameras, or two with different numbers of images.
     """
     if len(views) not in (1, 2) or len({len(side.corners) for side in views}) != 1:
-        raise ValueError("Give the views of one camera, or of two with as many pictures each.")
+        raise ValueError("Give the views of one camera, or of two with as many images each.")
     with jax.enable_x64(True):
         return _mono(views[0], config) if len(views) == 1 else _stereo(views[0], views[1], config)
 

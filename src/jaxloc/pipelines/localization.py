@@ -22,7 +22,7 @@ from jaxloc.poses import SE2
 from jaxloc.poses.planar import compose_poses, relative_poses
 from jaxloc.sensors import DistanceField, LaserScan, LikelihoodField, OccupancyMap, OdometryMotion
 
-_CLOUD = 600  # particles of a step that are kept for pictures
+_CLOUD = 600  # particles of a step that are kept for images
 _STREAK = 3  # scans in a row that must agree before the robot counts as found
 
 
@@ -235,7 +235,7 @@ def select_scans(
 
 
 class _Kept(eqx.Module):
-    """What a picture and a table need of a state."""
+    """What an image and a table need of a state."""
 
     cloud: Float[Array, "m 3"]
 

@@ -1,4 +1,4 @@
-"""Which feature of the map is which in the picture: attributes, a pose, and what the others say.
+"""Which feature of the map is which in the image: attributes, a pose, and what the others say.
 
 Without knowledge n features can be matched in n! ways. Five sources of information cut that down (Kelly's list), each a
 record that can be left out:

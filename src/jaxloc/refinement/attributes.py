@@ -43,7 +43,7 @@ class Blocks(Attribute):
     """Blocks of pixels, or any descriptors, compared by normalized correlation.
 
     Attributes:
-        values: "n d", grey levels or descriptor entries.
+        values: "n d", gray levels or descriptor entries.
         sigma: of ``1 - correlation`` between views of one feature.
     """
 
@@ -74,7 +74,7 @@ class CornerStrength(Attribute):
 
 
 class Curvature(Attribute):
-    """Curvature of the outline or of the range picture.
+    """Curvature of the outline or of the range image.
 
     Attributes:
         values: 1/m.

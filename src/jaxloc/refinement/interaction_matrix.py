@@ -1,4 +1,4 @@
-"""Flow of points in the picture of a moving camera: the interaction matrix, and problems whose unknown is the motion.
+"""Flow of points in the image of a moving camera: the interaction matrix, and problems whose unknown is the motion.
 
 The model is explained in `image_velocity` [K-78].
 """
@@ -19,11 +19,11 @@ _LEAST_RATIO = 8.0
 
 
 class FreeMotion(eqx.Module):
-    """How a camera moves as far as a picture without depth tells.
+    """How a camera moves as far as an image without depth tells.
 
     Attributes:
         direction: of the translation, camera axes.
-        angular_velocity: rad/s (or rad a picture, if flow is a displacement), camera axes.
+        angular_velocity: rad/s (or rad an image, if flow is a displacement), camera axes.
     """
 
     direction: Direction
@@ -169,7 +169,7 @@ class DirectionalFlow(Problem):
 
 @eqx.filter_jit
 def interaction_matrix(points: Float[Array, "n 2"], depth: Float[Array, " n"]) -> Float[Array, "n 2 6"]:
-    """How points of the picture move with the twist of the camera: ``flow_k = L_k (v, w)``.
+    """How points of the image move with the twist of the camera: ``flow_k = L_k (v, w)``.
 
     Args:
         points: normalized coordinates (x right, y down).

@@ -1,12 +1,12 @@
-"""The velocity of a camera from the velocities of features in its picture, with depth and without.
+"""The velocity of a camera from the velocities of features in its image, with depth and without.
 
-A static point at ``(x, y)`` (normalized, x right, y down) and depth Z moves in the picture of a camera with the twist
+A static point at ``(x, y)`` (normalized, x right, y down) and depth Z moves in the image of a camera with the twist
 (v, w), in the camera's own axes, by
 
     ``flow = A v / Z + B w``,  ``A = [[-1, 0, x], [0, -1, y]]``,
     ``B = [[x y, -(1 + x^2), y], [1 + y^2, -x y, -x]]``.
 
-Depth and translation enter by their quotient only: twice the depth with twice the translation is the same picture, so
+Depth and translation enter by their quotient only: twice the depth with twice the translation is the same image, so
 without depth a camera tells the direction of its translation, and its rotation. The part of a rotation does not know
 depth at all. Over a narrow field of view B is almost constant and looks like a translation before a wall: a wide one
 tells them apart.

@@ -10,7 +10,7 @@ from jaxloc.poses import SE3
 from jaxloc.poses.lie_group import as_floats, matmul
 from jaxloc.sensors.lenses import Lens
 
-_NEAREST = 1e-6  # points nearer than this to the plane of the camera have no picture, m
+_NEAREST = 1e-6  # points nearer than this to the plane of the camera have no image, m
 
 
 class Pinhole(eqx.Module):
@@ -89,7 +89,7 @@ class Pinhole(eqx.Module):
 
     @eqx.filter_jit
     def in_front(self, points: Float[Array, "n 3"]) -> Bool[Array, " n"]:
-        """Whether points have a picture: ahead of the camera and where its lens is one-to-one."""
+        """Whether points have an image: ahead of the camera and where its lens is one-to-one."""
         return self.in_front_components(points[:, 0], points[:, 1], points[:, 2])
 
     def in_front_components(

@@ -65,7 +65,7 @@ class GroundCamera(eqx.Module):
             ValueError: the camera has a lens, which bends straight lines.
         """
         if self.camera.lens is not None:
-            raise ValueError("GroundCamera.homography: a lens bends lines; undistort the picture first.")
+            raise ValueError("GroundCamera.homography: a lens bends lines; undistort the image first.")
         axes = self.axes()
         ground = jnp.stack([axes[0], axes[1], -self.height * axes[2]], axis=1)
         return matmul(self.camera.matrix(), ground)
@@ -88,7 +88,7 @@ class GroundCamera(eqx.Module):
         return self.camera.project_components(*self.camera_components(x, y))
 
     def sees_components(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
-        """Whether points of the ground are ahead of the camera, where its lens is one-to-one (not: in the picture)."""
+        """Whether points of the ground are ahead of the camera, where its lens is one-to-one (not: in the image)."""
         return self.camera.in_front_components(*self.camera_components(x, y))
 
     def to_ground_components(

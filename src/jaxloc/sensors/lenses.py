@@ -82,7 +82,7 @@ class BrownConrady(Lens):
         r2 = x * x + y * y
         gain = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k[4] if len(k) > 4 else k2))
         if len(k) == 8:
-            # A rational lens has poles far outside its picture: stay finite there.
+            # A rational lens has poles far outside its image: stay finite there.
             gain = gain / jnp.maximum(1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])), 1e-3)
         cross = 2.0 * x * y
         return x * gain + p1 * cross + p2 * (r2 + 2.0 * x * x), y * gain + p1 * (r2 + 2.0 * y * y) + p2 * cross
@@ -113,7 +113,7 @@ class BrownConrady(Lens):
         return _implicit_step(self, x, y, xd, yd)
 
     def in_domain(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
-        """Whether the lens is one-to-one from the axis out to these ideal points (it may fold beyond its picture)."""
+        """Whether the lens is one-to-one from the axis out to these ideal points (it may fold beyond its image)."""
         ok = (jnp.abs(x) < _FAR) & (jnp.abs(y) < _FAR)
         for i in range(1, _RAY_SAMPLES + 1):
             fraction = i / _RAY_SAMPLES

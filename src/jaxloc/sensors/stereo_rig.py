@@ -58,7 +58,7 @@ class StereoRig(eqx.Module):
         return jnp.stack([u_left, u_left - jnp.where(front, disparity, 0.0), v])
 
     def in_front(self, points: Float[Array, "n 3"]) -> Bool[Array, " n"]:
-        """Whether points have a picture."""
+        """Whether points have an image."""
         return self.camera.in_front(points)
 
     def in_front_components(

@@ -89,7 +89,7 @@ class FunctionProblem(Problem):
 
 
 class NormalEquations(NamedTuple):
-    """Second-order picture of the cost about a state.
+    """Second-order image of the cost about a state.
 
     Attributes:
         cost: sum of rho.

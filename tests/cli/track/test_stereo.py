@@ -52,7 +52,7 @@ def test_rows_pictures_and_report(recording, tmp_path):
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["frames"] == FRAMES and metrics["track_frames"] == len(rows)
     assert {"detect", "flow", "group", "filter"} <= set(metrics["stages_ms"])
-    assert len(list((out / "pictures").glob("*.png"))) == 8
+    assert len(list((out / "images").glob("*.png"))) == 8
     assert yaml.safe_load((out / "config.yaml").read_text())["command"] == "track"
     assert "Seen from above" in (out / "report.html").read_text()
     assert len((out / "trajectory.txt").read_text().splitlines()) == FRAMES

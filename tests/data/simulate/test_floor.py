@@ -1,4 +1,4 @@
-"""Simulated floors: the texture's band, exact poses of the pictures, odometry with its covariance."""
+"""Simulated floors: the texture's band, exact poses of the images, odometry with its covariance."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Pictures of pallets [K-14, K-76]: the places of their edges and their grey levels against closed forms."""
+"""Images of pallets [K-14, K-76]: the places of their edges and their gray levels against closed forms."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +29,7 @@ def test_edges_lie_where_the_model_says(pose):
         assert abs(np.sum(slope * around) / np.sum(slope) - column) < 0.06
 
 
-def test_grey_levels_are_those_of_the_scene():
+def test_gray_levels_are_those_of_the_scene():
     image = render_pallet(euro_long(), np.array([2.0, 0.0, 0.0]), camera_at(), shape=SHAPE, scene=PLAIN)
     rows = 119.5 + FOCAL * (0.35 - 0.03) / 2.0
     assert abs(float(image[round(rows), 239]) - PLAIN.wood) <= 1.0

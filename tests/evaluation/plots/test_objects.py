@@ -1,4 +1,4 @@
-"""Pictures of moving objects: what is drawn, and where."""
+"""Images of moving objects: what is drawn, and where."""
 
 import io
 

@@ -15,7 +15,7 @@ IDS = [type(kind).__name__ for kind in KINDS]
 
 
 def scene(rng, shape=(180, 240)):
-    """Squares of random grey on noise, many on the left, few on the right."""
+    """Squares of random gray on noise, many on the left, few on the right."""
     image = cv2.GaussianBlur(rng.uniform(90, 110, shape), (0, 0), 1.5)
     for _ in range(150):
         u, v = int(rng.uniform(0, 1) ** 2 * 225), int(rng.uniform(5, 160))
@@ -126,8 +126,8 @@ def test_wrong_options_are_refused(rng):
         detect(ORB(), image, 10, mask=np.ones((3, 3), bool))
 
 
-def test_grey_bytes_survive_bad_numbers():
-    got = library.grey_bytes(np.array([[np.nan, np.inf, -np.inf, 300.0, -4.0, 7.5]]))
+def test_gray_bytes_survive_bad_numbers():
+    got = library.gray_bytes(np.array([[np.nan, np.inf, -np.inf, 300.0, -4.0, 7.5]]))
     assert got.tolist() == [[0, 255, 0, 255, 0, 8]]
 
 

@@ -20,7 +20,7 @@ def test_laplacian_equals_scipy(dtype, rng, sigma):
     ours = laplacian(jnp.asarray(image, dtype), sigma)
     theirs = sigma**2 * ndimage.gaussian_laplace(image, sigma, mode="mirror", truncate=4.0)
     assert ours.dtype == dtype
-    # SciPy does not correct what cutting the kernel leaves: a multiple of the blurred picture.
+    # SciPy does not correct what cutting the kernel leaves: a multiple of the blurred image.
     theirs -= np.mean(theirs - np.asarray(ours))
     np.testing.assert_allclose(ours, theirs, rtol=0.01, atol=0.3 if sigma < 2 else 0.1)
 

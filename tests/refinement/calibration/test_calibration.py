@@ -38,7 +38,7 @@ def truth(lens=BrownConrady, coefficients=(-0.25, 0.08, 1e-3, -5e-4, 0.0)):
 
 
 def poses(tilts=TILTS):
-    """Boards about 0.35 m away whose centers are spread over the picture."""
+    """Boards about 0.35 m away whose centers are spread over the image."""
     rng = np.random.default_rng(1)
     centers = np.column_stack([rng.uniform(-0.06, 0.06, (len(tilts), 2)), rng.uniform(0.33, 0.42, len(tilts))])
 

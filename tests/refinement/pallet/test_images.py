@@ -1,4 +1,4 @@
-"""From picture to pallet [K-14, K-74, K-75]: rendered pictures with exact truth, and pictures that hold no pallet."""
+"""From image to pallet [K-14, K-74, K-75]: rendered images with exact truth, and images that hold no pallet."""
 
 import equinox as eqx
 import jax
@@ -84,7 +84,7 @@ def test_covariance_is_consistent():
         found = detect(picture(TYPES[seed % 3], pose, seed=seed), camera_at())
         assert bool(found.estimate.ok)
         squared.append(float(found.estimate.gaussian().mahalanobis_squared(SE2(*pose))))
-    assert 1.0 < np.mean(squared) < 6.0, np.mean(squared)  # sigmas come from the picture, 0.01 px of doubt on top
+    assert 1.0 < np.mean(squared) < 6.0, np.mean(squared)  # sigmas come from the image, 0.01 px of doubt on top
 
 
 def test_confusion_of_the_bank():  # K-75
@@ -109,7 +109,7 @@ def test_wrong_kinds_and_empty_floors_are_rejected():
 
 
 def test_gradient_by_the_picture(x64):
-    """Along a change of blur and light, in double precision; an empty picture has none."""
+    """Along a change of blur and light, in double precision; an empty image has none."""
     camera = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), camera_at())
     kinds = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), (TYPES[0],))
     image = picture(TYPES[0], (2.0, 0.1, 0.2)).astype(jnp.float64)

@@ -1,4 +1,4 @@
-"""Prediction of a picture from a map [K-11, K-17, K-18, K-45]: OpenCV's warps are the oracle."""
+"""Prediction of an image from a map [K-11, K-17, K-18, K-45]: OpenCV's warps are the oracle."""
 
 import cv2
 import jax

@@ -36,8 +36,8 @@ def classify(
     """Tells which template of a bank an image shows, and where: the one of the highest correlation.
 
     Args:
-        image: grey levels.
-        templates: k grey pictures of one size.
+        image: gray levels.
+        templates: k gray images of one size.
         score: a correlation.
 
     Returns:

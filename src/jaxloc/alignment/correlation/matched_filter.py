@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Num
 
-from jaxloc.images.normalization import as_grey
+from jaxloc.images.normalization import as_gray
 
 
 class Response(eqx.Module):
@@ -36,7 +36,7 @@ class WhiteNoise(Noise):
     """Independent pixels.
 
     Attributes:
-        sigma: standard deviation, grey levels.
+        sigma: standard deviation, gray levels.
     """
 
     sigma: Float[Array, ""] | float
@@ -71,8 +71,8 @@ def respond(image: Num[Array, "h w"] | Any, pattern: Num[Array, "m n"] | Any, *,
     sigma^2.
 
     Args:
-        image: grey levels without background (subtract it); pixels that are not finite are taken as zero.
-        pattern: the known signal, grey levels; subtract its mean to be blind to the brightness of the background.
+        image: gray levels without background (subtract it); pixels that are not finite are taken as zero.
+        pattern: the known signal, gray levels; subtract its mean to be blind to the brightness of the background.
         noise: `WhiteNoise` or `ColoredNoise`.
 
     Returns:
@@ -91,8 +91,8 @@ def respond(image: Num[Array, "h w"] | Any, pattern: Num[Array, "m n"] | Any, *,
         >>> round(float(seen.gain), 2), round(float(seen.statistic[2, 3]), 2)
         (25.0, 5.0)
     """
-    pattern = as_grey(pattern)
-    image = as_grey(image, pattern.dtype)
+    pattern = as_gray(pattern)
+    image = as_gray(image, pattern.dtype)
     if any(n > m for n, m in zip(pattern.shape, image.shape, strict=True)):
         raise ValueError(f"A pattern of shape {pattern.shape} is larger than the image of shape {image.shape}.")
     density = noise.density(image.shape, image.dtype)

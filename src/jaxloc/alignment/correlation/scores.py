@@ -62,8 +62,8 @@ class Pair(eqx.Module):
     """An image and a template, ready to be compared.
 
     Attributes:
-        image: grey levels, finite.
-        template: grey levels, finite.
+        image: gray levels, finite.
+        template: gray levels, finite.
         mask: weights of the template's pixels, or None for all of them.
         by: how sums are computed.
     """
@@ -127,7 +127,7 @@ class Score(eqx.Module):
 
 
 class SumOfSquares(Score):
-    """``sum (I - T)^2``: the least is best; grey levels have to be the same in both pictures."""
+    """``sum (I - T)^2``: the least is best; gray levels have to be the same in both images."""
 
     best_is_least = True
 
@@ -138,7 +138,7 @@ class SumOfSquares(Score):
         return energy - 2.0 * pair.by.correlate(pair.image, pair.template) + jnp.sum(pair.template**2)
 
     def worst(self, pair: Pair) -> Float[Array, ""]:
-        """The largest sum that the range of grey levels allows."""
+        """The largest sum that the range of gray levels allows."""
         high = jnp.maximum(pair.image.max(), pair.template.max())
         return lax.stop_gradient(pair.count * (high - jnp.minimum(pair.image.min(), pair.template.min())) ** 2)
 

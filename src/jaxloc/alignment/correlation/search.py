@@ -22,7 +22,7 @@ from jaxloc.alignment.correlation.scores import (
     unknown_places,
 )
 from jaxloc.alignment.correlation.shift import STEPS, refine_shift
-from jaxloc.images.normalization import as_grey
+from jaxloc.images.normalization import as_gray
 from jaxloc.images.warps import Translation
 from jaxloc.solvers import Estimate, Status
 
@@ -64,8 +64,8 @@ def score_map(
     """Scores a template at every place of an image: ``s[v, u]`` compares ``template(x)`` with ``image(x + (u, v))``.
 
     Args:
-        image: grey levels, bytes or numbers; places that would touch a pixel that is not finite get the worst score.
-        template: grey levels, no larger than the image.
+        image: gray levels, bytes or numbers; places that would touch a pixel that is not finite get the worst score.
+        template: gray levels, no larger than the image.
         score: `SumOfSquares`, `NormalizedCorrelation` or `ZeroMeanCorrelation`.
         by: `Direct` or `Fourier`; by default the quicker one for the template's size.
         mask: weights of the template's pixels, in [0, 1]; pixels that are not finite get weight zero. Without a
@@ -109,13 +109,13 @@ def search(
     peak, brightness projected out; (0.01 px)^2 is added for interpolation.
 
     Args:
-        image: grey levels, bytes or numbers.
-        template: grey levels.
+        image: gray levels, bytes or numbers.
+        template: gray levels.
         window: the part of the image to search; all of it by default.
         score: `SumOfSquares`, `NormalizedCorrelation` or `ZeroMeanCorrelation`.
         by: `Direct` or `Fourier`; by default the quicker one for the template's size.
         mask: weights of the template's pixels.
-        sigma: standard deviation of the image's noise, grey levels; from what differs at the peak if not given.
+        sigma: standard deviation of the image's noise, gray levels; from what differs at the peak if not given.
         max_ratio: how near to perfect the second peak may come: largest trusted ratio of what is missing at the best
             peak (sum of squares, or 1 - correlation) to what is missing at the second.
 
@@ -149,8 +149,8 @@ def search(
 
 def _checked(image: Any, template: Any, mask: Any, by: Correlator | None) -> tuple[Pair, Bool[Array, "h w"]]:
     """Finite floats of one dtype, and where the image was."""
-    template = as_grey(template)
-    image = as_grey(image, template.dtype)
+    template = as_gray(template)
+    image = as_gray(image, template.dtype)
     if any(n > m for n, m in zip(template.shape, image.shape, strict=True)):
         raise ValueError(f"A template of shape {template.shape} is larger than the image of shape {image.shape}.")
     if mask is not None and mask.shape != template.shape:

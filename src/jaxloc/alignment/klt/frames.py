@@ -18,7 +18,7 @@ class Frame(eqx.Module):
             through level 0 only.
         finite: Pixels of level 0, its border included, that are numbers.
         clean: Whether all of them are.
-        spread: Sorted sample of grey levels of a coarse level, to compare exposures.
+        spread: Sorted sample of gray levels of a coarse level, to compare exposures.
         shape: Rows and columns of the image.
         levels: Number of pyramid levels.
         margin: Repeated pixels round every level.
@@ -37,7 +37,7 @@ def build_frame(image: Float[Array, "h w"] | UInt8[Array, "h w"], levels: int, m
     """Builds the pyramid and packs it; what is not a number becomes the mean of the others.
 
     Args:
-        image: Grey image; integers become float32.
+        image: Gray image; integers become float32.
         levels: Number of pyramid levels.
         margin: Pixels by which the border of every level is repeated.
 
@@ -50,10 +50,10 @@ def build_frame(image: Float[Array, "h w"] | UInt8[Array, "h w"], levels: int, m
         >>> frame.atlas.shape, frame.finite.shape
         ((84, 62), (52, 62))
     """
-    grey, finite, clean = _clean(image)
-    pyramid = (grey, *gaussian_pyramid(lax.stop_gradient(grey), levels=levels)[1:])
+    gray, finite, clean = _clean(image)
+    pyramid = (gray, *gaussian_pyramid(lax.stop_gradient(gray), levels=levels)[1:])
     padded = [jnp.pad(level, margin, mode="edge") for level in pyramid]
-    atlas = jnp.zeros(_atlas_shape(image.shape, levels, margin), dtype=grey.dtype)
+    atlas = jnp.zeros(_atlas_shape(image.shape, levels, margin), dtype=gray.dtype)
     for level, corner in zip(padded, _corners(image.shape, levels, margin), strict=True):
         atlas = lax.dynamic_update_slice(atlas, level, (corner[1], corner[0]))
     return Frame(atlas, jnp.pad(finite, margin, mode="edge"), clean, _spread(pyramid), image.shape, levels, margin)
@@ -99,7 +99,7 @@ def level_sizes(frame: Frame) -> Int[Array, "l 2"]:
 
 
 def relative_gain(previous: Frame, current: Frame) -> Float[Array, ""]:
-    """Contrast of one frame relative to another: slope of the regression of sorted grey levels on sorted grey levels.
+    """Contrast of one frame relative to another: slope of the regression of sorted gray levels on sorted gray levels.
 
     The lowest and highest twentieth are left out, so that neither saturated pixels nor small new bright things count.
     No pixels are matched: the scene may move.
@@ -122,14 +122,14 @@ def relative_gain(previous: Frame, current: Frame) -> Float[Array, ""]:
     first, second = (frame.spread[cut : frame.spread.shape[0] - cut] for frame in (previous, current))
     first, second = first - jnp.mean(first), second - jnp.mean(second)
     below, above = jnp.sum(first * first), jnp.sum(first * second)
-    # A spread of less than a hundredth of a grey level a sample is none.
+    # A spread of less than a hundredth of a gray level a sample is none.
     some = (below > 1e-4 * first.size) & (above > 1e-4 * first.size)
     gain = jnp.where(some, above, 1.0) / jnp.where(some, below, 1.0)
     return lax.stop_gradient(jnp.clip(gain, 0.125, 8.0))
 
 
 def _spread(pyramid: tuple[Float[Array, "_ _"], ...]) -> Float[Array, " s"]:
-    """Sorted grey levels, evenly taken, of a level smooth enough to have little noise."""
+    """Sorted gray levels, evenly taken, of a level smooth enough to have little noise."""
     level = pyramid[min(2, len(pyramid) - 1)]
     stride = max(1, round((level.size / _SAMPLES) ** 0.5))
     return jnp.sort(lax.stop_gradient(level)[::stride, ::stride].reshape(-1))

@@ -42,7 +42,7 @@ class Tracked(eqx.Module):
     Attributes:
         points: Pixels (right, down) in the current image; the guess where `ok` is False.
         ok: Whether the result can be trusted.
-        residual: Root mean square of `I - g T - b` over the patch, grey levels.
+        residual: Root mean square of `I - g T - b` over the patch, gray levels.
         covariance: Of the pixels, px^2.
         gain: Contrast of the patch relative to the previous image.
         correlation: Of the two patches.

@@ -17,7 +17,7 @@ def prepare(image: Float[Array, "h w"] | UInt8[Array, "h w"], *, options: Klt = 
     """Builds what tracking needs of an image, so that a video's frames are each prepared once.
 
     Args:
-        image: Grey image of any dtype; integers become float32.
+        image: Gray image of any dtype; integers become float32.
         options: Patch size and levels. Small images get fewer levels.
 
     Returns:
@@ -53,12 +53,12 @@ def track(
 
     Minimizes `sum (I(x + d) - g T(x) - b)^2` over d, gain g and bias b of every patch T of the previous image, from the
     coarsest level of a pyramid to the finest, with the template's derivatives (inverse composition). The gain stays
-    near that of the whole image, which is known beforehand from the spread of grey levels: a free gain would shrink
+    near that of the whole image, which is known beforehand from the spread of gray levels: a free gain would shrink
     the basin. Gradients with respect to both images and the points are those of the solution (implicit function
     theorem).
 
     Args:
-        previous: Grey image; integers are taken as float32.
+        previous: Gray image; integers are taken as float32.
         current: Image of the same shape.
         points: Pixels (right, down) of the previous image.
         initial: Guesses in the current image; without them, points stay where they were.

@@ -1,4 +1,4 @@
-"""Lucas-Kanade: a template laid upon an image by the derivatives of their grey levels."""
+"""Lucas-Kanade: a template laid upon an image by the derivatives of their gray levels."""
 
 from jaxloc.alignment.lucas_kanade.align import align
 from jaxloc.alignment.lucas_kanade.brightness import Bias, Brightness, Correlation, GainBias, Unchanged

@@ -12,7 +12,7 @@ from jaxloc.alignment.lucas_kanade.iteration import Descended, Limits, descend
 from jaxloc.alignment.lucas_kanade.normal_equations import zero_brightness
 from jaxloc.alignment.lucas_kanade.options import LucasKanade
 from jaxloc.alignment.lucas_kanade.pyramid_level import Frame, Level
-from jaxloc.images.normalization import as_grey
+from jaxloc.images.normalization import as_gray
 from jaxloc.images.warps import Warp
 from jaxloc.solvers import Estimate
 
@@ -34,23 +34,23 @@ def align(
     template and weights (implicit function theorem), in forward and reverse mode.
 
     Args:
-        image: grey levels, bytes or numbers; nan where there is no picture.
-        template: grey levels; nan where it does not count.
+        image: gray levels, bytes or numbers; nan where there is no image.
+        template: gray levels; nan where it does not count.
         warp: its class: `Translation`, `Euclidean`, `Similarity`, `Affine` or `Homography`.
         initial: where to start, a warp of any class from template pixels to image pixels; the identity by default.
         method: formulation, descent, brightness, scales, kernel, limits.
         weights: of the template's pixels, or a mask.
-        sigma: standard deviation of the image's noise, grey levels; measured from the residual if not given.
+        sigma: standard deviation of the image's noise, gray levels; measured from the residual if not given.
 
     Returns:
         Estimate of the warp, with the covariance of its tangent (``W @ exp(d)``, pixels). It holds the noise of both
-        pictures, as far as interpolation lets it through; it knows nothing of a warp that is too simple for the scene.
+        images, as far as interpolation lets it through; it knows nothing of a warp that is too simple for the scene.
         ``ok`` is False when the texture leaves directions undetermined (a flat template, a single edge), when the
         search did not settle, or when the result contradicts the model: too little of the template on the image, too
         little correlation, a template folded over. The value is finite in any case.
 
     Raises:
-        ValueError: a picture has not two axes, weights have another shape than the template, or the formulation does
+        ValueError: an image has not two axes, weights have another shape than the template, or the formulation does
             not know the warp.
 
     References:
@@ -73,23 +73,23 @@ def align(
 
 
 def take(image: Any, template: Any, weights: Any, sigma: Any, method: LucasKanade) -> Evidence:
-    """The pictures as numbers of one dtype, with their weights.
+    """The images as numbers of one dtype, with their weights.
 
     Raises:
         ValueError: shapes that do not fit.
     """
-    template = as_grey(template)
+    template = as_gray(template)
     if weights is not None and weights.shape != template.shape:
         raise ValueError(f"align: weights of shape {weights.shape} do not fit a template of shape {template.shape}.")
     given = jnp.ones_like(template) if weights is None else jnp.asarray(weights).astype(template.dtype)
     sigma = None if sigma is None else jnp.asarray(sigma, template.dtype)
     frame = Frame.of(template.shape, method.normalized)
-    return Evidence(as_grey(image, template.dtype), template, given, sigma, frame, method)
+    return Evidence(as_gray(image, template.dtype), template, given, sigma, frame, method)
 
 
 def start_of(warp: type[Warp], initial: Warp | None, template: Any) -> Warp:
     """The start as a member of the group, in the template's dtype."""
-    dtype = as_grey(template).dtype
+    dtype = as_gray(template).dtype
     start = warp.identity(dtype) if initial is None else warp.of(initial)
     return jax.tree.map(lambda leaf: leaf.astype(dtype), start)
 

@@ -1,4 +1,4 @@
-"""How grey levels may differ between two aligned pictures: what is solved for beside the warp and then dropped."""
+"""How gray levels may differ between two aligned images: what is solved for beside the warp and then dropped."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -15,11 +15,11 @@ class Brightness(eqx.Module):
 
     @abstractmethod
     def columns(self, template: Float[Array, " n"]) -> Float[Array, "k n"]:
-        """The pictures B_k, given the template with zero mean and unit variance."""
+        """The images B_k, given the template with zero mean and unit variance."""
 
 
 class Unchanged(Brightness):
-    """Grey levels stay as they are: the sum of squared differences."""
+    """Gray levels stay as they are: the sum of squared differences."""
 
     correlating: ClassVar[bool] = False
 
@@ -29,7 +29,7 @@ class Unchanged(Brightness):
 
 
 class Bias(Brightness):
-    """All grey levels move by one number."""
+    """All gray levels move by one number."""
 
     correlating: ClassVar[bool] = False
 

@@ -2,7 +2,7 @@
 
 The solution is a root of the estimating equations ``g(W) = sum w J (image(W(x)) - ...) = 0``, whose J may be the
 template's: not the derivative of any cost. So covariance and derivatives are those of a root: with ``S = dg/dW`` and
-the pictures' noise carried through g.
+the images' noise carried through g.
 """
 
 from typing import Any
@@ -26,11 +26,11 @@ from jaxloc.solvers.estimate import Status
 
 
 class Evidence(eqx.Module):
-    """The pictures, and how they are compared.
+    """The images, and how they are compared.
 
     Attributes:
-        image: grey levels.
-        template: grey levels.
+        image: gray levels.
+        template: gray levels.
         weights: of the template's pixels.
         sigma: standard deviation of the image's noise, or None.
         frame: of the template.
@@ -46,17 +46,17 @@ class Evidence(eqx.Module):
 
     @property
     def matching(self) -> Matching:
-        """How pictures are compared."""
+        """How images are compared."""
         method = self.method
         sigma = None if self.sigma is None else jnp.hypot(self.sigma, method.template_noise * self.sigma)
         return Matching(method.formulation, method.interpolation, method.loss, sigma)
 
     def levels(self) -> list[Level]:
-        """Both pictures at all scales, the coarsest first."""
+        """Both images at all scales, the coarsest first."""
         return [self._level(scaled) for scaled in self.method.scales.of(self.image, self.template)]
 
     def finest(self) -> Level:
-        """Both pictures at the last scale."""
+        """Both images at the last scale."""
         return self._level(self.method.scales.of(self.image, self.template)[-1])
 
     def _level(self, scaled: Scaled) -> Level:
@@ -155,7 +155,7 @@ def conclude(
     """Judges a solution at the finest scale.
 
     Args:
-        evidence: the pictures.
+        evidence: the images.
         warp: the solution, in normalized coordinates.
         brightness: coefficients of its columns.
         moved: length of the last step, px.
@@ -228,7 +228,7 @@ class _Match(eqx.Module):
 
 
 class _Noise(eqx.Module):
-    """Variances: of a difference of both pictures' pixels, and of the score."""
+    """Variances: of a difference of both images' pixels, and of the score."""
 
     of_difference: Float[Array, ""]
     of_score: Float[Array, "d d"]
@@ -244,7 +244,7 @@ class _Noise(eqx.Module):
             variance = mean / (passed.residual + template_part)
         else:
             variance = evidence.sigma**2
-        # Two pictures without any difference leave the noise of rounding.
+        # Two images without any difference leave the noise of rounding.
         variance = jnp.maximum(variance, (level.spread * jnp.finfo(match.weight.dtype).eps) ** 2 + 1e-12)
         score_part = variance * (passed.solution + template_part)
         return _Noise(variance * (1.0 + template_part), score_part * matmul(match.steepest, match.steepest.T))

@@ -1,4 +1,4 @@
-"""The four ways to linearize ``sum (image(W(x)) - template(x))^2``: which picture is differentiated, how W is updated.
+"""The four ways to linearize ``sum (image(W(x)) - template(x))^2``: which image is differentiated, how W is updated.
 
 References:
     Baker and Matthews, "Lucas-Kanade 20 years on: a unifying framework", IJCV 56(3), 2004, section 3 [K-27, K-72].
@@ -19,12 +19,12 @@ from jaxloc.poses.lie_group import matmul
 
 
 class Linearized(eqx.Module):
-    """The image under a warp, and how one of both pictures changes when the warp moves.
+    """The image under a warp, and how one of both images changes when the warp moves.
 
     Attributes:
         values: the image at the template's pixels.
         known: where there is one.
-        slope: derivatives of the differentiated picture, "2 n".
+        slope: derivatives of the differentiated image, "2 n".
         right: derivative of the column by the warp's tangent, "d n".
         down: derivative of the row.
     """
@@ -37,18 +37,18 @@ class Linearized(eqx.Module):
 
     @property
     def steepest(self) -> Float[Array, "d n"]:
-        """Steepest descent images: change of the differentiated picture by the tangent."""
+        """Steepest descent images: change of the differentiated image by the tangent."""
         return self.slope[0][None] * self.right + self.slope[1][None] * self.down
 
 
 class Formulation(eqx.Module):
-    """Which picture is differentiated and how the warp moves."""
+    """Which image is differentiated and how the warp moves."""
 
     inverse: eqx.AbstractClassVar[bool]
 
     @abstractmethod
     def linearize(self, level: Level, warp: Warp, method: AbstractInterpolation) -> Linearized:
-        """Both pictures about a warp of normalized coordinates."""
+        """Both images about a warp of normalized coordinates."""
 
     @abstractmethod
     def update(self, warp: Warp, step: Float[Array, " d"]) -> Warp:
@@ -56,11 +56,11 @@ class Formulation(eqx.Module):
 
     @abstractmethod
     def bend(self, level: Level, warp: Warp, linear: Linearized) -> Float[Array, "d d n"]:
-        """Second derivative of the warp along the differentiated picture's slope: ``sum_c slope_c d2W_c / dp dp``."""
+        """Second derivative of the warp along the differentiated image's slope: ``sum_c slope_c d2W_c / dp dp``."""
 
     @abstractmethod
     def second(self, level: Level, warp: Warp, method: AbstractInterpolation) -> Float[Array, "3 n"]:
-        """Second derivatives (uu, uv, vv) of the differentiated picture at the template's pixels."""
+        """Second derivatives (uu, uv, vv) of the differentiated image at the template's pixels."""
 
 
 class ForwardsAdditive(Formulation):
@@ -214,7 +214,7 @@ def _flow_bend(warp: type[Warp], level: Level, linear: Linearized) -> Float[Arra
 
 
 def second_derivatives(picture: Float[Array, "h w"], level: Level) -> Float[Array, "3 h w"]:
-    """Second derivatives (uu, uv, vv) of a picture at a level's scale, by normalized coordinates."""
+    """Second derivatives (uu, uv, vv) of an image at a level's scale, by normalized coordinates."""
     scale = level.frame.radius / level.factor
     along, across = derivatives(picture) * scale
     (uu, uv), (_, vv) = derivatives(along) * scale, derivatives(across) * scale

@@ -1,4 +1,4 @@
-"""The normal equations of one comparison of two pictures, brightness eliminated and outliers weighted down."""
+"""The normal equations of one comparison of two images, brightness eliminated and outliers weighted down."""
 
 from typing import Any
 
@@ -20,13 +20,13 @@ _SCALE_SAMPLES = 1024  # pixels that tell the residual's scale: sorting all of t
 
 
 class Matching(eqx.Module):
-    """How pictures are compared: what `equations` needs beside them.
+    """How images are compared: what `equations` needs beside them.
 
     Attributes:
-        formulation: which picture is differentiated.
+        formulation: which image is differentiated.
         interpolation: of the image.
         loss: kernel on residuals over their scale.
-        sigma: scale of residuals, grey levels; None measures it by the median of their sizes.
+        sigma: scale of residuals, gray levels; None measures it by the median of their sizes.
     """
 
     formulation: Formulation
@@ -43,7 +43,7 @@ class Equations(eqx.Module):
         gradient: its derivative.
         brightness: coefficients of the brightness columns.
         gain: contrast of the image over that of the template.
-        mean_cost: half the weighted mean squared residual, grey levels squared; infinite where nothing is seen.
+        mean_cost: half the weighted mean squared residual, gray levels squared; infinite where nothing is seen.
     """
 
     hessian: Float[Array, "d d"]
@@ -186,11 +186,11 @@ def equations(
     """The normal equations at a warp.
 
     Args:
-        level: both pictures at one scale.
+        level: both images at one scale.
         prepared: what does not change with the warp.
         warp: in normalized coordinates.
         brightness: coefficients by which outliers are told.
-        matching: how pictures are compared.
+        matching: how images are compared.
         second: how much of the second derivatives' part enters the Hessian.
 
     Returns:
@@ -228,7 +228,7 @@ def gain_of(level: Level, coefficients: Float[Array, " k"]) -> Float[Array, ""]:
 def _second_order(
     level: Level, warp: Warp, linear: Linearized, residual: Float[Array, " n"], matching: Matching
 ) -> Float[Array, "d d"]:
-    """Sum of residuals times second derivatives of the differentiated picture along the warp."""
+    """Sum of residuals times second derivatives of the differentiated image along the warp."""
     uu, uv, vv = matching.formulation.second(level, warp, matching.interpolation)
     along = uu[None] * linear.right + uv[None] * linear.down
     across = uv[None] * linear.right + vv[None] * linear.down

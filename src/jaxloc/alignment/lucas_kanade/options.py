@@ -11,7 +11,7 @@ from jaxloc.solvers.robust_kernels import Loss, Quadratic
 
 
 class LucasKanade(eqx.Module):
-    """How two pictures are aligned.
+    """How two images are aligned.
 
     Attributes:
         formulation: `InverseCompositional`, `ForwardsCompositional`, `ForwardsAdditive` or `InverseAdditive`.
@@ -22,7 +22,7 @@ class LucasKanade(eqx.Module):
         interpolation: of the image.
         max_steps: bound on the number of steps at each scale.
         tolerance: length of a step that counts as none, px; coarser scales are content with more.
-        template_noise: standard deviation of the template's noise over that of the image's: 1 for two pictures of one
+        template_noise: standard deviation of the template's noise over that of the image's: 1 for two images of one
             camera, 0 for a clean map.
         min_coverage: least part of the template that must lie on the image.
         min_correlation: least correlation of a trusted result.

@@ -1,4 +1,4 @@
-"""Both pictures at one scale, in coordinates that know no pixels: the template reaches from -1 to 1."""
+"""Both images at one scale, in coordinates that know no pixels: the template reaches from -1 to 1."""
 
 from typing import Any
 
@@ -59,16 +59,16 @@ class Level(eqx.Module):
     """One scale, with the template's pixels along the last axis.
 
     Attributes:
-        image: the picture, with nan where there is none.
-        channels: the picture and its derivatives by u and v, where they are needed.
-        picture: the template, with nan where there is none.
+        image: the image, with nan where there is none.
+        channels: the image and its derivatives by u and v, where they are needed.
+        image: the template, with nan where there is none.
         template: its values, n pixels, zero where there is none.
         u: normalized column of each template pixel.
         v: normalized row.
         weight: of each template pixel; zero where there is none.
         slope: derivative of the template by u and v, "2 n".
         columns: what brightness adds, "k n".
-        spread: standard deviation of the template, grey levels, by which the first column is divided.
+        spread: standard deviation of the template, gray levels, by which the first column is divided.
         frame: of the template.
         factor: pixels of the full size to one of this scale.
         shape: rows and columns of the template at this scale.

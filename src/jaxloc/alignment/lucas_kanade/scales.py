@@ -1,4 +1,4 @@
-"""From coarse to fine: at which scales two pictures are compared, one after the other."""
+"""From coarse to fine: at which scales two images are compared, one after the other."""
 
 from abc import abstractmethod
 
@@ -10,12 +10,12 @@ from jaxloc.images.pyramid import gaussian_pyramid
 
 
 class Scaled(eqx.Module):
-    """Both pictures at one scale.
+    """Both images at one scale.
 
     Attributes:
         image: the smoothed or smaller image.
         template: the smoothed or smaller template.
-        factor: pixels of the full pictures to one of these.
+        factor: pixels of the full images to one of these.
         margin: pixels along the border of the template that smoothing has mixed with what it made up beyond it.
     """
 
@@ -30,22 +30,22 @@ class Scales(eqx.Module):
 
     @abstractmethod
     def of(self, image: Float[Array, "h w"], template: Float[Array, "p q"]) -> list[Scaled]:
-        """Both pictures at each scale."""
+        """Both images at each scale."""
 
 
 class FullSize(Scales):
-    """Only the pictures themselves."""
+    """Only the images themselves."""
 
     def of(self, image: Float[Array, "h w"], template: Float[Array, "p q"]) -> list[Scaled]:
-        """The pictures."""
+        """The images."""
         return [Scaled(image, template, 1, 0)]
 
 
 class Pyramid(Scales):
-    """Smaller pictures, each half the size of the next.
+    """Smaller images, each half the size of the next.
 
     Attributes:
-        levels: their number, the full size included; fewer where a picture would be left with less than `least` pixels.
+        levels: their number, the full size included; fewer where an image would be left with less than `least` pixels.
         least: pixels that the shorter side of the coarsest template has at least.
 
     References:
@@ -66,15 +66,15 @@ class Pyramid(Scales):
 
 
 class Blurred(Scales):
-    """Full-sized pictures, smoothed less and less: for templates too small for a pyramid.
+    """Full-sized images, smoothed less and less: for templates too small for a pyramid.
 
     Attributes:
-        sigmas: standard deviations of the Gaussians, px, falling; 0 is the picture itself.
+        sigmas: standard deviations of the Gaussians, px, falling; 0 is the image itself.
     """
 
     sigmas: tuple[float, ...] = eqx.field(static=True, default=(4.0, 2.0, 0.0))
 
     def of(self, image: Float[Array, "h w"], template: Float[Array, "p q"]) -> list[Scaled]:
-        """The smoothed pictures."""
+        """The smoothed images."""
         pairs = [(smooth(image, s), smooth(template, s)) if s > 0 else (image, template) for s in self.sigmas]
         return [Scaled(*pair, 1, round(s)) for pair, s in zip(pairs, self.sigmas, strict=True)]

@@ -53,7 +53,7 @@ class GaussNewtonStep(Descent):
 
 
 class NewtonStep(Descent):
-    """The whole Hessian, second derivatives of the picture included: noisy, and indefinite not far from the answer.
+    """The whole Hessian, second derivatives of the image included: noisy, and indefinite not far from the answer.
 
     Attributes:
         newton: 1 for the Hessian; -1 turns its second-order part round. Only so are the curves of the paper met: the

@@ -13,26 +13,26 @@ from jaxloc.alignment.lucas_kanade.pyramid_level import Frame
 from jaxloc.alignment.mutual_information.density import Binning, joint_density, log_ratio, pixel_weights
 from jaxloc.images.gradients import smooth
 from jaxloc.images.interpolation import Bicubic, sample
-from jaxloc.images.normalization import as_grey
+from jaxloc.images.normalization import as_gray
 from jaxloc.images.warps import Warp
 from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers import Estimate, Status
 
 
 class MutualInformation(eqx.Module):
-    """How pictures are aligned by mutual information.
+    """How images are aligned by mutual information.
 
     Attributes:
-        bins: of each grey level; the fewer, the wider its splines, which pull the maximum aside where the image's
-            grey levels change along the way.
-        blurs: standard deviations by which both pictures are smoothed, from coarse to fine, px; a last blur of half a
+        bins: of each gray level; the fewer, the wider its splines, which pull the maximum aside where the image's
+            gray levels change along the way.
+        blurs: standard deviations by which both images are smoothed, from coarse to fine, px; a last blur of half a
             pixel keeps interpolation from favoring whole pixels.
         max_steps: bound on the number of steps at each scale.
         tolerance: length of a step that counts as none, px.
         min_coverage: least part of the template that must lie on the image.
         min_information: least mutual information of a trusted result, nats.
         least_sigma: error of a pixel's place that noise does not show, px: interpolation favors places between pixels,
-            and smoothing a picture is not smoothing what another camera makes of it.
+            and smoothing an image is not smoothing what another camera makes of it.
     """
 
     bins: int = eqx.field(static=True, default=32)
@@ -59,8 +59,8 @@ def align(
     curvature is turned round. The value has the derivatives of the solution (implicit function theorem).
 
     Args:
-        image: grey levels, bytes or numbers; nan where there is no picture.
-        template: grey levels; nan where it does not count.
+        image: gray levels, bytes or numbers; nan where there is no image.
+        template: gray levels; nan where it does not count.
         warp: its class: `Translation`, `Euclidean`, `Similarity`, `Affine` or `Homography`.
         initial: where to start, a warp of any class from template pixels to image pixels; the identity by default.
         method: bins, scales, limits.
@@ -76,7 +76,7 @@ def align(
         is told.
 
     Raises:
-        ValueError: a picture has not two axes, the mask has another shape, or there are too few bins.
+        ValueError: an image has not two axes, the mask has another shape, or there are too few bins.
 
     References:
         Viola and Wells, 1997; Dowson and Bowden, "Mutual information for Lucas-Kanade tracking (MILK)", PAMI 30(1),
@@ -92,8 +92,8 @@ def align(
         >>> bool(fit.ok), [round(x, 1) for x in fit.value.translation.tolist()]
         (True, [10.3, 8.6])
     """
-    template = as_grey(template)
-    image = as_grey(image, template.dtype)
+    template = as_gray(template)
+    image = as_gray(image, template.dtype)
     weight = pixel_weights(template, mask, method.bins)
     start = warp.identity(template.dtype) if initial is None else warp.of(initial)
     start = jax.tree.map(lambda leaf: leaf.astype(template.dtype), start)
@@ -101,7 +101,7 @@ def align(
 
 
 class _Scale(eqx.Module):
-    """Both pictures at one scale; the image has a second channel that is above zero near unknown pixels."""
+    """Both images at one scale; the image has a second channel that is above zero near unknown pixels."""
 
     channels: Float[Array, "h w 2"]
     shares: Float[Array, "b n"]
@@ -112,7 +112,7 @@ class _Scale(eqx.Module):
     frame: Frame = eqx.field(static=True)
 
     def sample(self, u: Float[Array, " n"], v: Float[Array, " n"]) -> tuple[Array, Array]:
-        """Grey levels of the image at normalized coordinates, and where they are known."""
+        """Gray levels of the image at normalized coordinates, and where they are known."""
         (center_u, center_v), radius = self.frame.center, self.frame.radius
         uv = jnp.stack([u * radius + center_u, v * radius + center_v], axis=1)
         read = sample(self.channels, uv, method=Bicubic())
@@ -139,7 +139,7 @@ class _Ascent(eqx.Module):
 
 
 def _scales(image: Array, template: Array, weight: Array, method: MutualInformation) -> list[_Scale]:
-    """Both pictures at all blurs, the coarsest first."""
+    """Both images at all blurs, the coarsest first."""
     frame, known, finite = Frame.of(template.shape), weight > 0, jnp.isfinite(image)
     image, template = _filled(image, finite), _filled(template, jnp.isfinite(template))
     v, u = jnp.meshgrid(*(jnp.arange(side, dtype=weight.dtype) for side in template.shape), indexing="ij")

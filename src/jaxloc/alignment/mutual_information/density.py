@@ -1,4 +1,4 @@
-"""How much the grey levels of one picture tell about those of another.
+"""How much the gray levels of one image tell about those of another.
 
 The joint density of both is a histogram smoothed with cubic B-splines (Parzen windows), so that mutual information has
 derivatives.
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
-from jaxloc.images.normalization import as_grey
+from jaxloc.images.normalization import as_gray
 from jaxloc.poses.lie_group import matmul
 
 _LEAST_BINS = 5
@@ -25,22 +25,22 @@ def mutual_information(
     bins: int = 32,
     mask: Num[Array, "h w"] | Bool[Array, "h w"] | None = None,
 ) -> Float[Array, ""]:
-    """How much the grey levels of one picture tell about those of another: ``sum p(a, b) log(p(a, b) / (p(a) p(b)))``.
+    """How much the gray levels of one image tell about those of another: ``sum p(a, b) log(p(a, b) / (p(a) p(b)))``.
 
     The joint density is a histogram in which each pixel pair is spread over 4x4 bins by cubic B-splines. The range of
-    grey levels, least to greatest, is taken from the pictures and has no derivative.
+    gray levels, least to greatest, is taken from the images and has no derivative.
 
     Args:
-        a: grey levels; pixels that are not finite in either picture do not count.
-        b: grey levels.
-        bins: static number of bins of each picture, at least 5.
+        a: gray levels; pixels that are not finite in either image do not count.
+        b: gray levels.
+        bins: static number of bins of each image, at least 5.
         mask: weights of pixels.
 
     Returns:
-        Nats; zero for a flat picture. Smoothing makes it less than that of the grey levels themselves.
+        Nats; zero for a flat image. Smoothing makes it less than that of the gray levels themselves.
 
     Raises:
-        ValueError: pictures or mask differ in shape, or there are too few bins.
+        ValueError: images or mask differ in shape, or there are too few bins.
 
     References:
         Viola and Wells, "Alignment by maximization of mutual information", IJCV 24(2), 1997; Thevenaz and Unser, 2000,
@@ -53,11 +53,11 @@ def mutual_information(
         >>> bool(mutual_information(image, 1 - image**2) > 1.0), bool(mutual_information(image, other) < 0.2)
         (True, True)
     """
-    a = as_grey(a)
-    b = as_grey(b, a.dtype)
+    a = as_gray(a)
+    b = as_gray(b, a.dtype)
     weight = pixel_weights(a, mask, bins)
     if b.shape != a.shape:
-        raise ValueError(f"mutual_information: pictures of shapes {a.shape} and {b.shape} differ.")
+        raise ValueError(f"mutual_information: images of shapes {a.shape} and {b.shape} differ.")
     weight = jnp.where(jnp.isfinite(b), weight, 0.0)
     known = weight > 0
     of_a, of_b = (Binning.of(jnp.where(known, x, 0.0), known, bins) for x in (a, b))
@@ -67,17 +67,17 @@ def mutual_information(
 
 
 def pixel_weights(template: Array, mask: Any, bins: int) -> Float[Array, "p q"]:
-    """Weights of a picture's pixels, zero where not finite; refuses a mask of another shape, and too few bins."""
+    """Weights of an image's pixels, zero where not finite; refuses a mask of another shape, and too few bins."""
     if bins < _LEAST_BINS:
         raise ValueError(f"Mutual information with {bins} bins: cubic B-splines need at least {_LEAST_BINS}.")
     if mask is not None and mask.shape != template.shape:
-        raise ValueError(f"A mask of shape {mask.shape} does not fit a picture of shape {template.shape}.")
+        raise ValueError(f"A mask of shape {mask.shape} does not fit an image of shape {template.shape}.")
     weight = jnp.ones_like(template) if mask is None else jnp.asarray(mask).astype(template.dtype)
     return jnp.where(jnp.isfinite(template), weight, 0.0)
 
 
 class Binning(eqx.Module):
-    """Grey levels to positions on the bins, ``1 ... bins - 2``, and the shares of the bins."""
+    """Gray levels to positions on the bins, ``1 ... bins - 2``, and the shares of the bins."""
 
     low: Float[Array, ""]
     per_level: Float[Array, ""]
@@ -88,7 +88,7 @@ class Binning(eqx.Module):
         """The bins between the least and the greatest known value."""
         values = lax.stop_gradient(values)
         high, low = jnp.max(jnp.where(known, values, -jnp.inf)), jnp.min(jnp.where(known, values, jnp.inf))
-        # What rounding leaves of a flat picture is no texture.
+        # What rounding leaves of a flat image is no texture.
         level = jnp.maximum(jnp.abs(high), jnp.abs(low))
         textured = high - low > 32.0 * float(jnp.finfo(values.dtype).eps) * level
         span = jnp.where(textured, high - low, 1.0)
@@ -104,7 +104,7 @@ class Binning(eqx.Module):
         return _spline(self.distances(values))
 
     def spread_with_derivatives(self, values: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        """Shares, and their first and second derivatives by the grey level."""
+        """Shares, and their first and second derivatives by the gray level."""
         x = self.distances(values)
         sign, size = jnp.sign(x), jnp.abs(x)
         near, far = size < 1.0, size < 2.0

@@ -1,4 +1,4 @@
-"""``jaxloc calibrate``: find the board in every picture, calibrate, write cameras, corners and report."""
+"""``jaxloc calibrate``: find the board in every image, calibrate, write cameras, corners and report."""
 
 import re
 from pathlib import Path
@@ -20,12 +20,12 @@ _MOST_CORNERS = 10_000
 
 
 class Search(eqx.Module):
-    """What was found in the pictures of one camera.
+    """What was found in the images of one camera.
 
     Attributes:
-        paths: the pictures.
+        paths: the images.
         corners: px, or None where the board was not found.
-        reasons: why a picture was skipped; empty where it was not.
+        reasons: why an image was skipped; empty where it was not.
         shape: (rows, columns).
     """
 
@@ -41,7 +41,7 @@ def run_images(
     """Calibrates a camera, or two.
 
     Args:
-        images: pictures, or folders of them, of the (left) camera.
+        images: images, or folders of them, of the (left) camera.
         right: those of the right camera.
         board: inner corners as "9x6", and the edge of a square, m.
         out: folder for the results.
@@ -63,7 +63,7 @@ def run_images(
     config = default if config_path is None else configuration.read_config(config_path, default)
     lists = [list_images(paths) for paths in (images, right) if paths]
     if len({len(paths) for paths in lists}) > 1:
-        raise DataError("--right", f"has {len(lists[1])} pictures, the left camera {len(lists[0])}: they must be pairs")
+        raise DataError("--right", f"has {len(lists[1])} images, the left camera {len(lists[0])}: they must be pairs")
     searches = [search(paths, grid, title) for paths, title in zip(lists, ("boards", "right boards"), strict=False)]
     views = _views(searches, board_points(grid, square))
     inputs = {"command": "calibrate", "images": [str(path) for path in images], "grid": board[0], "square": square}
@@ -73,7 +73,7 @@ def run_images(
     with jax.enable_x64(True):
         result = pipeline.run(views, config)
         if not result.ok:
-            raise DataError(images[0], f"no calibration: {result.status}; take more pictures, with the board tilted")
+            raise DataError(images[0], f"no calibration: {result.status}; take more images, with the board tilted")
         record = report.Record(searches, result)
         with session.output_folder(out):
             write_cameras(out, result, searches[0].shape)
@@ -86,17 +86,17 @@ def run_images(
 
 
 def list_images(paths: list[Path]) -> list[Path]:
-    """Pictures in natural order (2 before 10), folders in place of what is in them.
+    """Images in natural order (2 before 10), folders in place of what is in them.
 
     Raises:
-        DataError: when a path is not there, or a folder holds no picture.
+        DataError: when a path is not there, or a folder holds no image.
     """
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
             inside = sorted((p for p in path.iterdir() if p.suffix.lower() in _IMAGES and p.is_file()), key=_natural)
             if not inside:
-                raise DataError(path, "holds no picture")
+                raise DataError(path, "holds no image")
             found += inside
         elif path.is_file():
             found.append(path)
@@ -106,10 +106,10 @@ def list_images(paths: list[Path]) -> list[Path]:
 
 
 def search(paths: list[Path], grid: tuple[int, int], title: str) -> Search:
-    """Looks for the board in every picture; one that cannot be used is skipped, with the reason.
+    """Looks for the board in every image; one that cannot be used is skipped, with the reason.
 
     Raises:
-        DataError: when no picture can be read.
+        DataError: when no image can be read.
     """
     pictures_shape = _common_shape(paths)
     corners: list[np.ndarray | None] = []
@@ -119,7 +119,7 @@ def search(paths: list[Path], grid: tuple[int, int], title: str) -> Search:
             image = _read(path)
             found, reason = None, ""
             if image is None:
-                reason = "cannot be read as a picture"
+                reason = "cannot be read as an image"
             elif image.shape != pictures_shape:
                 reason = f"is {_size(image.shape)}, the others are {_size(pictures_shape)}"
             else:
@@ -202,12 +202,12 @@ def _views(searches: list[Search], board: np.ndarray) -> tuple[Any, ...]:
     from jaxloc.pipelines import calibration as pipeline
 
     if len({found.shape for found in searches}) > 1:
-        raise DataError("--right", f"pictures are {_size(searches[1].shape)}, the left ones {_size(searches[0].shape)}")
+        raise DataError("--right", f"images are {_size(searches[1].shape)}, the left ones {_size(searches[0].shape)}")
     views = []
     for found in searches:
         used = np.array([corners is not None for corners in found.corners])
         if not used.any():
-            raise DataError(found.paths[0], f"{found.reasons[0]}; nor does any other of {len(used)} pictures help")
+            raise DataError(found.paths[0], f"{found.reasons[0]}; nor does any other of {len(used)} images help")
         empty = np.zeros((len(board), 2))
         stacked = np.stack([empty if corners is None else corners for corners in found.corners])
         views.append(pipeline.Views(board, stacked, used, found.shape))
@@ -240,10 +240,10 @@ def _read(path: Path) -> np.ndarray | None:
 
 
 def _common_shape(paths: list[Path]) -> tuple[int, int]:
-    """The size that most pictures have; of equals, the first."""
+    """The size that most images have; of equals, the first."""
     shapes = [image.shape for image in map(_read, paths) if image is not None]
     if not shapes:
-        raise DataError(paths[0], "cannot be read as a picture, nor can any other")
+        raise DataError(paths[0], "cannot be read as an image, nor can any other")
     return max(dict.fromkeys(shapes), key=shapes.count)
 
 

@@ -14,7 +14,7 @@ class Record:
     """A finished calibration.
 
     Args:
-        searches: what was found in the pictures, a camera each.
+        searches: what was found in the images, a camera each.
         result: of the pipeline.
     """
 
@@ -23,7 +23,7 @@ class Record:
         self.result = result
 
     def skipped(self) -> list[str]:
-        """A line for each picture that was not used."""
+        """A line for each image that was not used."""
         pairs = [pair for found in self.searches for pair in zip(found.paths, found.reasons, strict=True)]
         return [f"{path}: {reason}" for path, reason in pairs if reason]
 
@@ -32,7 +32,7 @@ class Record:
         used = [sum(corners is not None for corners in found.corners) for found in self.searches]
         squares = [(side.rms**2, count) for side, count in zip(self.result.sides, used, strict=True)]
         numbers: dict[str, Any] = {
-            "pictures": sum(len(found.paths) for found in self.searches),
+            "images": sum(len(found.paths) for found in self.searches),
             "boards_used": sum(used),
             "skipped": self.skipped(),
             "rms_px": float(np.sqrt(sum(square * count for square, count in squares) / sum(used))),
@@ -70,7 +70,7 @@ class Record:
             report.Highlight("boards", str(metrics["boards_used"])),
         )
         skipped = metrics["skipped"]
-        summary = f"{metrics['boards_used']} of {metrics['pictures']} pictures used."
+        summary = f"{metrics['boards_used']} of {metrics['images']} images used."
         if skipped:
             summary += " Skipped: " + "; ".join(skipped) + "."
         title = "Stereo calibration" if len(self.searches) == 2 else "Camera calibration"
@@ -92,7 +92,7 @@ def _boards(side: Any, found: Any) -> report.Table:
     rows = []
     for path, reason, rms in zip(found.paths, found.reasons, side.board_rms, strict=True):
         rows.append((path.name, reason or f"{rms:.3f}"))
-    return report.Table(("picture", "rms (px)"), tuple(rows))
+    return report.Table(("image", "rms (px)"), tuple(rows))
 
 
 def _scatter(side: Any, found: Any) -> Any:

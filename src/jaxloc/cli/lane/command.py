@@ -1,4 +1,4 @@
-"""``jaxloc lane``: follow the lane, write a row a picture as they come, then metrics and report."""
+"""``jaxloc lane``: follow the lane, write a row an image as they come, then metrics and report."""
 
 import dataclasses
 import itertools
@@ -21,7 +21,7 @@ def run_recording(path: Path, camera_path: Path, speed: float, out: Path, config
     """Follows the lane in a recording.
 
     Args:
-        path: picture, folder of pictures, or video.
+        path: image, folder of images, or video.
         camera_path: YAML file of the camera.
         speed: of the vehicle, m/s.
         out: folder for the results.
@@ -68,7 +68,7 @@ def run_recording(path: Path, camera_path: Path, speed: float, out: Path, config
 def _check_shape(file: CameraFile, recording: LaneRecording) -> None:
     if file.shape is not None and file.shape != recording.shape:
         sizes = [f"{columns}x{rows}" for rows, columns in (file.shape, recording.shape)]
-        raise DataError(file.path, f"is of pictures of {sizes[0]}, but those of {recording.path} are {sizes[1]}")
+        raise DataError(file.path, f"is of images of {sizes[0]}, but those of {recording.path} are {sizes[1]}")
 
 
 def _stream(
@@ -78,7 +78,7 @@ def _stream(
     record: report.Record,
     interruption: session.Interruption,
 ) -> None:
-    """Writes the rows and the annotated picture of each picture, until the end or an interrupt."""
+    """Writes the rows and the annotated image of each image, until the end or an interrupt."""
     with ExitStack() as stack:
         lanes = stack.enter_context(RowWriter(out / "lane.csv", "frame,offset,heading,curvature,confidence,ok"))
         borders = stack.enter_context(RowWriter(out / "borders.csv", "frame,row,left,right"))
@@ -105,7 +105,7 @@ def _append(lanes: RowWriter, borders: RowWriter, frame: LaneFrame, step: Any) -
 
 
 def _announce(metrics: dict[str, Any], out: Path) -> None:
-    words = [f"{metrics['frames']} pictures", f"lane seen in {metrics['frames_ok']}"]
+    words = [f"{metrics['frames']} images", f"lane seen in {metrics['frames_ok']}"]
     if metrics["pitch_estimated"]:
         words.append(f"pitch estimated: {metrics['pitch_rad']:.4f} rad")
     elif metrics["pitch_assumed"]:

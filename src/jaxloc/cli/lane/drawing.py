@@ -1,4 +1,4 @@
-"""Pictures with the lane drawn in, one by one or as a video."""
+"""Images with the lane drawn in, one by one or as a video."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,11 +21,11 @@ def annotate(color: UInt8[np.ndarray, "h w 3"], step: Any) -> UInt8[np.ndarray, 
     """Draws the borders, and writes what was found.
 
     Args:
-        color: the picture, in OpenCV's order of colors.
+        color: the image, in OpenCV's order of colors.
         step: the lane in it; borders that are only predicted are orange, one that is about to be crossed is red.
 
     Returns:
-        A new picture.
+        A new image.
     """
     cv2 = load()
     picture = color.copy()
@@ -49,20 +49,20 @@ def annotate(color: UInt8[np.ndarray, "h w 3"], step: Any) -> UInt8[np.ndarray, 
 
 @contextmanager
 def open_gallery(recording: LaneRecording, out: Path) -> Iterator[Callable[[LaneFrame, np.ndarray], None]]:
-    """Where annotated pictures go: a video for a video, a folder of pictures for pictures.
+    """Where annotated images go: a video for a video, a folder of images for images.
 
     Args:
         recording: what they are of.
         out: folder for the results.
 
     Yields:
-        A function of a frame and its annotated picture.
+        A function of a frame and its annotated image.
 
     Raises:
         DataError: when they cannot be written.
     """
     if recording.rate is None:
-        folder = out / "pictures"
+        folder = out / "images"
         folder.mkdir(exist_ok=True)
         yield lambda frame, picture: _write_picture(folder / f"{Path(frame.name).stem}.jpg", picture)
         return

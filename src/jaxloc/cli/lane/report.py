@@ -11,7 +11,7 @@ from jaxloc.evaluation import plots, report
 from jaxloc.features.opencv.library import load
 
 _MOST_PICTURES = 12
-_SMALL = 480  # columns of a picture in the report
+_SMALL = 480  # columns of an image in the report
 _WARN = 1.0  # s before a line is crossed
 
 
@@ -19,7 +19,7 @@ class Record:
     """What a run has given so far.
 
     Args:
-        recording: the pictures.
+        recording: the images.
         pitch: as it was estimated; None if the camera's file told it.
         used: pitch that the run begins with, rad.
     """
@@ -33,7 +33,7 @@ class Record:
         self._pictures: dict[int, np.ndarray] = {}
 
     def add(self, name: str, time: float | None, step: Any, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Adds a picture."""
+        """Adds an image."""
         every = max(1, -(-len(self.recording) // _MOST_PICTURES))
         if len(self.steps) % every == 0:
             height = round(picture.shape[0] * _SMALL / picture.shape[1])
@@ -75,16 +75,16 @@ class Record:
     def page(self, metrics: dict[str, Any]) -> str:
         """The page."""
         text = "The borders that the estimate implies; orange where it is only predicted."
-        sections = [report.Section("Pictures", text, self._gallery(), raster=True)]
+        sections = [report.Section("Images", text, self._gallery(), raster=True)]
         sections += self._curves()
         if metrics["not_ok"]:
             rows = tuple((name,) for name in metrics["not_ok"])
-            text = "Pictures in which the lane was not seen; the numbers of their rows are predicted."
-            sections.append(report.Section("Not seen", text, table=report.Table(("picture",), rows)))
+            text = "Images in which the lane was not seen; the numbers of their rows are predicted."
+            sections.append(report.Section("Not seen", text, table=report.Table(("image",), rows)))
         sections.append(report.Section("Numbers", "SI units, or the unit in the name.", table=results.table(metrics)))
-        summary = f"{metrics['frames_ok']} of {metrics['frames']} pictures show the lane. {_pitch_words(metrics)}"
+        summary = f"{metrics['frames_ok']} of {metrics['frames']} images show the lane. {_pitch_words(metrics)}"
         if self.interrupted:
-            summary += " Interrupted: the report ends with the last picture that was looked at."
+            summary += " Interrupted: the report ends with the last image that was looked at."
         title = f"Lane: {self.recording.path.name}"
         return report.render_report(title, sections, summary=summary, highlights=_highlights(metrics))
 
@@ -137,7 +137,7 @@ def _pitch_words(metrics: dict[str, Any]) -> str:
 
 def _highlights(metrics: dict[str, Any]) -> tuple[report.Highlight, ...]:
     wanted = (
-        ("frames_ok", "pictures with a lane", "{:d}"),
+        ("frames_ok", "images with a lane", "{:d}"),
         ("median_offset_m", "median offset", "{:+.2f} m"),
         ("median_sigma_offset_m", "its uncertainty", "{:.3f} m"),
         ("median_width_m", "lane width", "{:.2f} m"),

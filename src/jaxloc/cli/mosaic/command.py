@@ -1,4 +1,4 @@
-"""``jaxloc mosaic``: join pictures of a floor to a map, then metrics and report."""
+"""``jaxloc mosaic``: join images of a floor to a map, then metrics and report."""
 
 from pathlib import Path
 from typing import Any
@@ -20,11 +20,11 @@ _LIGHTEST = 255.0
 
 
 def run_frames(frames: Path, odometry: Path, camera: Path, out: Path, config_path: Path | None) -> int:
-    """Makes a mosaic of a folder of pictures.
+    """Makes a mosaic of a folder of images.
 
     Args:
-        frames: folder; pictures are taken in the order of their names.
-        odometry: TUM file with a pose of the camera over the floor for each picture: x to the top of the picture, y to
+        frames: folder; images are taken in the order of their names.
+        odometry: TUM file with a pose of the camera over the floor for each image: x to the top of the image, y to
             its left; only the motions between rows count, and only in the plane.
         camera: file of the camera, with its height over the floor.
         out: folder for the results.
@@ -54,7 +54,7 @@ def run_frames(frames: Path, odometry: Path, camera: Path, out: Path, config_pat
         except ValueError as error:
             raise DataError(odometry, " ".join(str(error).split())) from None
         if not built.used.any():
-            raise DataError(frames, "no picture overlaps another: there is nothing to join")
+            raise DataError(frames, "no image overlaps another: there is nothing to join")
         _write_map(built, out)
         times = np.asarray(stamped.trajectory.times, np.float64) + stamped.start
         _write_path(times, built.poses, out)
@@ -65,16 +65,16 @@ def run_frames(frames: Path, odometry: Path, camera: Path, out: Path, config_pat
 
 
 def find_pictures(folder: Path) -> list[Path]:
-    """Pictures of a folder, by name.
+    """Images of a folder, by name.
 
     Raises:
-        DataError: when there is no such folder, or less than two pictures in it.
+        DataError: when there is no such folder, or less than two images in it.
     """
     if not folder.is_dir():
         raise DataError(folder, "no such folder")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _ENDINGS)
     if len(paths) < 2:
-        raise DataError(folder, f"holds {len(paths)} pictures ({', '.join(_ENDINGS)}); a mosaic needs two or more")
+        raise DataError(folder, f"holds {len(paths)} images ({', '.join(_ENDINGS)}); a mosaic needs two or more")
     return paths
 
 
@@ -87,12 +87,12 @@ def planar_rows(stamped: StampedTrajectory) -> np.ndarray:
 def _read_odometry(path: Path, count: int) -> StampedTrajectory:
     stamped = tum.read_trajectory(path)
     if len(stamped.trajectory) != count:
-        raise DataError(path, f"has {len(stamped.trajectory)} poses for {count} pictures; give one a picture")
+        raise DataError(path, f"has {len(stamped.trajectory)} poses for {count} images; give one an image")
     return stamped
 
 
 def _read_ground(path: Path) -> tuple[Any, tuple[int, int] | None]:
-    """The camera over the floor, and the size of its pictures where the file says it."""
+    """The camera over the floor, and the size of its images where the file says it."""
     from jaxloc.sensors.ground_camera import GroundCamera
 
     record = read_camera(path)
@@ -109,7 +109,7 @@ def _read_pictures(paths: list[Path], shape: tuple[int, int] | None) -> np.ndarr
         data = np.fromfile(path, np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
         if image is None:
-            raise DataError(path, "is no picture that can be read")
+            raise DataError(path, "is no image that can be read")
         rows, columns = image.shape if shape is None else shape
         shape = (rows, columns)
         if image.shape != shape:
@@ -120,7 +120,7 @@ def _read_pictures(paths: list[Path], shape: tuple[int, int] | None) -> np.ndarr
 
 
 def _write_map(built: Any, out: Path) -> None:
-    """The picture (its first row is the top: the largest y), gaps black, and its place on the floor."""
+    """The image (its first row is the top: the largest y), gaps black, and its place on the floor."""
     mosaic = built.mosaic
     values = np.clip(np.rint(np.asarray(mosaic.values)), 1.0, _LIGHTEST)
     picture = np.where(np.asarray(mosaic.known), values, 0.0).astype(np.uint8)[::-1]
@@ -143,7 +143,7 @@ def _write_path(times: np.ndarray, poses: np.ndarray, out: Path) -> None:
 
 
 def _announce(metrics: dict[str, Any], out: Path) -> None:
-    words = [f"{metrics['pictures_used']} of {metrics['pictures']} pictures joined"]
+    words = [f"{metrics['pictures_used']} of {metrics['images']} images joined"]
     if metrics["left_out"]:
         words.append("left out: " + ", ".join(metrics["left_out"][:5]) + (", ..." * (len(metrics["left_out"]) > 5)))
     words.append(f"{metrics['loop_closures']} loop closures")

@@ -16,7 +16,7 @@ class Record:
     """What a run has given.
 
     Args:
-        names: of the pictures.
+        names: of the images.
         times: their stamps, s.
         odometry: (x, y, heading) of the camera by odometry, m and rad.
         built: what the pipeline made of them.
@@ -26,7 +26,7 @@ class Record:
         self.names, self.times, self.odometry, self.built = names, times, odometry, built
 
     def residuals(self, *, closes: bool) -> np.ndarray:
-        """What registrations that were taken and the final poses disagree by, px, with the later picture's number."""
+        """What registrations that were taken and the final poses disagree by, px, with the later image's number."""
         poses, resolution = self.built.poses, float(self.built.mosaic.raster.resolution)
         rows = []
         for pair in self.built.pairs:
@@ -46,7 +46,7 @@ class Record:
         left = [row[1] for closes in (False, True) for row in self.residuals(closes=closes)]
         return results.finite(
             {
-                "pictures": len(self.names),
+                "images": len(self.names),
                 "pictures_used": int(built.used.sum()),
                 "left_out": [self.names[number] for number in built.left_out],
                 "registrations": len(taken),
@@ -68,26 +68,24 @@ class Record:
     def page(self, metrics: dict[str, Any]) -> str:
         """The page."""
         picture = plots.draw_map_path(self._image(), self.built.poses, self.odometry, self.built.used)
-        text = "The mosaic with the path of the camera; the reference is its odometry, dots are pictures left out."
+        text = "The mosaic with the path of the camera; the reference is its odometry, dots are images left out."
         sections = [report.Section("Mosaic", text, picture, raster=True)]
         sections += self._residual_sections()
         if metrics["left_out"]:
             rows = tuple((str(number), self.names[number]) for number in self.built.left_out)
-            text = "Pictures that overlap no other, or show nothing; their poses are those of the odometry."
-            sections.append(report.Section("Left out", text, table=report.Table(("number", "picture"), rows)))
+            text = "Images that overlap no other, or show nothing; their poses are those of the odometry."
+            sections.append(report.Section("Left out", text, table=report.Table(("number", "image"), rows)))
         sections.append(report.Section("Numbers", "SI units, or the unit in the name.", table=results.table(metrics)))
-        summary = (
-            f"{metrics['pictures_used']} of {metrics['pictures']} pictures, {metrics['loop_closures']} loop closures."
-        )
+        summary = f"{metrics['pictures_used']} of {metrics['images']} images, {metrics['loop_closures']} loop closures."
         return report.render_report("Floor mosaic", sections, summary=summary, highlights=_highlights(metrics))
 
     def _image(self) -> plots.MapImage:
         mosaic = self.built.mosaic
         every = max(1, -(-max(mosaic.raster.shape) // _MOST_COLUMNS))
         values, known = (np.asarray(part)[::every, ::every] for part in (mosaic.values, mosaic.known))
-        grey = np.where(known, np.clip(values / 255.0, 0.0, 1.0), 1.0)
+        gray = np.where(known, np.clip(values / 255.0, 0.0, 1.0), 1.0)
         x, y = (float(number) for number in mosaic.raster.origin)
-        return plots.MapImage(grey, (x, y, 0.0), every * float(mosaic.raster.resolution))
+        return plots.MapImage(gray, (x, y, 0.0), every * float(mosaic.raster.resolution))
 
     def _residual_sections(self) -> list[report.Section]:
         begin = self.times - self.times[0]
@@ -106,7 +104,7 @@ class Record:
             ),
             report.Section(
                 "Uncertainty",
-                "Standard deviation of each pose, by the pose graph, from the first picture.",
+                "Standard deviation of each pose, by the pose graph, from the first image.",
                 plots.draw_curves(begin, {"position": 1e3 * sigma}, "sigma (mm)"),
             ),
         ]
@@ -114,7 +112,7 @@ class Record:
 
 def _highlights(metrics: dict[str, Any]) -> tuple[report.Highlight, ...]:
     wanted = (
-        ("pictures_used", "pictures joined", "{:d}"),
+        ("pictures_used", "images joined", "{:d}"),
         ("loop_closures", "loop closures", "{:d}"),
         ("median_residual_px", "median residual", "{:.3f} px"),
         ("moved_by_closure_px", "moved by closure", "{:.2f} px"),

@@ -1,7 +1,7 @@
 """A concrete floor, a camera that looks straight down at it, and a drive round a loop with exact truth.
 
-The floor *is* the bicubic interpolant of its texture, which is band-limited: where a picture was taken is known to any
-fraction of a pixel. Pictures average several rays a pixel, as a sensor does, through a lens and its vignetting.
+The floor *is* the bicubic interpolant of its texture, which is band-limited: where an image was taken is known to any
+fraction of a pixel. Images average several rays a pixel, as a sensor does, through a lens and its vignetting.
 """
 
 import cv2
@@ -20,10 +20,10 @@ _BLUR = 1.0  # of the finished texture, texels: leaves 1 % of the contrast at th
 
 
 class Floor(eqx.Module):
-    """A picture of a floor, seen from above.
+    """An image of a floor, seen from above.
 
     Args:
-        texture: "rows columns", grey levels; columns run along x, rows along y.
+        texture: "rows columns", gray levels; columns run along x, rows along y.
         resolution: edge of a texel, m.
         origin: (x, y) of the center of texel (0, 0), m.
     """
@@ -34,14 +34,14 @@ class Floor(eqx.Module):
 
 
 class FloorCamera(eqx.Module):
-    """A camera that looks at the floor from straight above, and the faults of its pictures.
+    """A camera that looks at the floor from straight above, and the faults of its images.
 
     Args:
-        ground: camera, lens and height; its road frame has x to the top of the picture and y to its left.
-        shape: rows and columns of a picture.
+        ground: camera, lens and height; its road frame has x to the top of the image and y to its left.
+        shape: rows and columns of an image.
         corner_loss: part of the light that the lens's rims take from the corners, beside the cosine's fourth power.
-        black: grey level of darkness.
-        noise: standard deviation of a grey level.
+        black: gray level of darkness.
+        noise: standard deviation of a gray level.
         samples: rays along an edge of a pixel.
     """
 
@@ -61,16 +61,16 @@ class FloorCamera(eqx.Module):
 
 
 class FloorDrive(eqx.Module):
-    """Pictures of a floor and what is known of where they were taken.
+    """Images of a floor and what is known of where they were taken.
 
     Attributes:
         floor: below.
-        camera: of the pictures.
-        frames: the pictures.
+        camera: of the images.
+        frames: the images.
         poses: true poses (x, y, heading) of the camera's road frame on the floor, m and rad.
-        odometry: measured motions (x, y, heading) from each picture to the next.
+        odometry: measured motions (x, y, heading) from each image to the next.
         covariances: of the motions, in the tangent at their ends.
-        gains: exposure of each picture.
+        gains: exposure of each image.
     """
 
     floor: Floor
@@ -152,7 +152,7 @@ def make_camera(
 
 
 class Photographer:
-    """Takes pictures of a floor at exact poses.
+    """Takes images of a floor at exact poses.
 
     Args:
         floor: below.
@@ -171,7 +171,7 @@ class Photographer:
     def take(
         self, pose: Float64[np.ndarray, "3"], *, gain: float = 1.0, rng: np.random.Generator | None = None
     ) -> UInt8[np.ndarray, "h w"]:
-        """A picture.
+        """An image.
 
         Args:
             pose: (x, y, heading) of the camera's road frame on the floor.
@@ -179,7 +179,7 @@ class Photographer:
             rng: of the sensor's noise; none without it.
 
         Returns:
-            Grey levels; beside the floor, those of darkness.
+            Gray levels; beside the floor, those of darkness.
         """
         x, y, heading = pose
         x0, y0 = self.floor.origin
@@ -216,11 +216,11 @@ def drive_loop(
     floor: Floor | None = None,
     sigmas: tuple[float, float, float] = (4e-4, 3e-4, 4e-3),
 ) -> FloorDrive:
-    """Drives once round a circle with a wobble: the last picture overlaps the first.
+    """Drives once round a circle with a wobble: the last image overlaps the first.
 
     Args:
         seed: fixes floor, path and all noise.
-        num_frames: pictures round the loop.
+        num_frames: images round the loop.
         step: from one to the next, m.
         camera: that takes them; `make_camera()` by default.
         floor: below; by default made to fit the loop.
@@ -257,7 +257,7 @@ def drive_loop(
 
 
 def _view_radius(camera: FloorCamera) -> float:
-    """How far from the foot of the axis the corners of a picture look, m."""
+    """How far from the foot of the axis the corners of an image look, m."""
     rows, columns = camera.shape
     u, v = jnp.array([-0.5, columns - 0.5]), jnp.array([-0.5, rows - 0.5])
     x, y = camera.ground.to_ground_components(u, v)

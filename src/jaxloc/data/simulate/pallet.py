@@ -1,7 +1,7 @@
-"""Pictures of a pallet on a floor before a wall, with exact truth.
+"""Images of a pallet on a floor before a wall, with exact truth.
 
 Every pixel looks along one ray at the face of the pallet, the floor or the wall. Rims of the holes and of the face are
-blurred by a Gaussian in the picture, in closed form, so that an edge lies where its geometry says to a small fraction
+blurred by a Gaussian in the image, in closed form, so that an edge lies where its geometry says to a small fraction
 of a pixel.
 """
 
@@ -17,18 +17,18 @@ from jaxloc.sensors import GroundCamera, Pinhole
 
 
 class PalletScene(eqx.Module):
-    """What is in the picture beside the pose.
+    """What is in the image beside the pose.
 
     Args:
-        wood: grey level of the face.
-        hole: grey level in the holes; they are a third darker above than below.
-        floor: grey level of the floor.
-        wall: grey level of the wall.
+        wood: gray level of the face.
+        hole: gray level in the holes; they are a third darker above than below.
+        floor: gray level of the floor.
+        wall: gray level of the wall.
         wall_range: distance of the wall, m.
-        texture: standard deviation of the grain on all surfaces, grey levels.
+        texture: standard deviation of the grain on all surfaces, gray levels.
         blur: standard deviation of the blur of edges, px.
-        shading: relative fall of the light from left to right over the picture.
-        noise: standard deviation of a grey level.
+        shading: relative fall of the light from left to right over the image.
+        noise: standard deviation of a gray level.
     """
 
     wood: float = 165.0
@@ -73,10 +73,10 @@ def render_pallet(
     scene: PalletScene = PalletScene(),
     seed: int = 0,
 ) -> UInt8[np.ndarray, "h w"]:
-    """A picture of a pallet.
+    """An image of a pallet.
 
     Args:
-        kind: of pallet; None for a picture without one.
+        kind: of pallet; None for an image without one.
         pose: (x, y, heading) of the pallet in the ground frame of the camera, m and rad.
         camera: level, or with pitch, roll and lens.
         shape: rows and columns.
@@ -84,7 +84,7 @@ def render_pallet(
         seed: fixes grain and noise.
 
     Returns:
-        Grey levels.
+        Gray levels.
 
     Example:
         >>> from jaxloc.data.simulate.pallet import make_camera, render_pallet
@@ -124,7 +124,7 @@ def _surroundings(rays, height: float, scene: PalletScene, rng: np.random.Genera
 def _draw(
     image, kind: PalletType, pose, rays, height: float, scene: PalletScene, rng: np.random.Generator
 ) -> Float64[np.ndarray, "h w"]:
-    """The face over the picture, with its shadow on the floor left out: only edges of the face are told."""
+    """The face over the image, with its shadow on the floor left out: only edges of the face are told."""
     along, level, ahead = _on_face(pose, rays, height)
 
     def cover(value: np.ndarray, rim: float) -> np.ndarray:

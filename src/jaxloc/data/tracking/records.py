@@ -27,7 +27,7 @@ class Detections(eqx.Module):
         types: rows of `names`; -1 where not valid.
         names: of the types.
         left_out: how many of a frame were not used: bad numbers, boxes without area, no room.
-        camera: positions in the rectified frame of camera 0 (x right, y down, z forward), m; None for pictures alone.
+        camera: positions in the rectified frame of camera 0 (x right, y down, z forward), m; None for images alone.
         positions: the same in the world, the frame of the first camera pose, m.
         sizes: height, width, length, m.
         headings: direction of the length in the world, rad: from the world's x axis towards its -z axis.
@@ -85,7 +85,7 @@ class Rows(eqx.Module):
     solids: Float64[np.ndarray, "n 7"] | None = None
 
     def usable(self) -> Bool[np.ndarray, " n"]:
-        """Rows whose numbers are finite; boxes need an area, but for solids, which may lie outside the picture."""
+        """Rows whose numbers are finite; boxes need an area, but for solids, which may lie outside the image."""
         good = np.isfinite(self.boxes).all(axis=1) & np.isfinite(self.scores)
         if self.solids is not None:
             return good & np.isfinite(self.solids).all(axis=1)

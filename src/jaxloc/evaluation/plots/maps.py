@@ -19,7 +19,7 @@ _ARROW = 0.7  # length of the arrow that shows a heading, m
 
 
 class MapImage(eqx.Module):
-    """A map as a picture.
+    """A map as an image.
 
     Args:
         gray: "rows columns", the lowest row first; 0 black, 1 white.
@@ -93,7 +93,7 @@ def draw_map_path(
 
 
 def draw_clouds(grid: MapImage, snapshots: Sequence[Snapshot]) -> "Figure":
-    """Draws clouds of particles over a map, one picture for each instant.
+    """Draws clouds of particles over a map, one image for each instant.
 
     Args:
         grid: the map.

@@ -54,7 +54,7 @@ def draw_objects(
 
 
 def encode(figure: "Figure") -> bytes:
-    """The picture as a PNG file."""
+    """The image as a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI)
     return buffer.getvalue()

@@ -38,7 +38,7 @@ def draw_tracks(
         camera: places of the camera.
         axes: of the places that point right and up in the figure; x and z for a view from above.
         unit: of the places.
-        downwards: whether the second of them points down, as in pictures.
+        downwards: whether the second of them points down, as in images.
 
     Returns:
         The figure.

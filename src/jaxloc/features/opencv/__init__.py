@@ -18,7 +18,7 @@ from jaxloc.features.opencv.detectors import (
     ShiTomasi,
     from_opencv,
 )
-from jaxloc.features.opencv.library import create, grey_bytes, load
+from jaxloc.features.opencv.library import create, gray_bytes, load
 
 __all__ = [
     "AKAZE",
@@ -40,7 +40,7 @@ __all__ = [
     "detectors",
     "find_chessboard",
     "from_opencv",
-    "grey_bytes",
+    "gray_bytes",
     "library",
     "load",
 ]

@@ -1,9 +1,9 @@
-"""Inner corners of a chessboard in a picture, by OpenCV on the host."""
+"""Inner corners of a chessboard in an image, by OpenCV on the host."""
 
 import numpy as np
 from jaxtyping import Array, Float64, Num
 
-from jaxloc.features.opencv.library import grey_bytes, load
+from jaxloc.features.opencv.library import gray_bytes, load
 
 _SHARE = 0.4  # of the distance to the nearest corner: the half window that holds one corner alone
 _LEAST, _MOST = 2, 11
@@ -16,7 +16,7 @@ def find_chessboard(image: Num[np.ndarray | Array, "h w"], grid: tuple[int, int]
     suits the smallest square, so that it holds no other corner.
 
     Args:
-        image: Grey image: bytes, or other numbers as grey levels 0-255 (0-1 if no value exceeds 1).
+        image: Gray image: bytes, or other numbers as gray levels 0-255 (0-1 if no value exceeds 1).
         grid: Inner corners along the rows of the board, and down: `(9, 6)` for 10 by 7 squares.
 
     Returns:
@@ -40,7 +40,7 @@ def find_chessboard(image: Num[np.ndarray | Array, "h w"], grid: tuple[int, int]
     """
     if min(grid) < 3:
         raise ValueError(f"The board has {grid[0]}x{grid[1]} inner corners; at least 3 each way can be found.")
-    cv2, pixels = load(), grey_bytes(image)
+    cv2, pixels = load(), gray_bytes(image)
     if min(pixels.shape) < 4 * min(grid):
         return None
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE

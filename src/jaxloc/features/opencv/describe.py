@@ -6,7 +6,7 @@ from jaxtyping import Array, Num
 
 from jaxloc.features.keypoints import Descriptors, Keypoints
 from jaxloc.features.opencv.detectors import AbstractFeature
-from jaxloc.features.opencv.library import grey_bytes, load
+from jaxloc.features.opencv.library import gray_bytes, load
 
 
 def describe(kind: AbstractFeature, image: Num[np.ndarray | Array, "h w"], keypoints: Keypoints) -> Descriptors:
@@ -17,7 +17,7 @@ def describe(kind: AbstractFeature, image: Num[np.ndarray | Array, "h w"], keypo
 
     Args:
         kind: The descriptor: `ORB()`, `SIFT()`, `KAZE()` or `AKAZE()`.
-        image: Grey image: bytes, or other numbers as grey levels 0-255 (0-1 if no value exceeds 1).
+        image: Gray image: bytes, or other numbers as gray levels 0-255 (0-1 if no value exceeds 1).
         keypoints: Where to describe.
 
     Returns:
@@ -35,7 +35,7 @@ def describe(kind: AbstractFeature, image: Num[np.ndarray | Array, "h w"], keypo
         >>> describe(ORB(), image, keypoints).values.shape
         (20, 32)
     """
-    pixels = grey_bytes(image)
+    pixels = gray_bytes(image)
     capacity = keypoints.valid.shape[0]
     extractor = kind.extractor(capacity)
     binary = extractor.descriptorType() == load().CV_8U

@@ -17,7 +17,7 @@ from jaxloc.features.opencv.detectors import (
     ShiTomasi,
     from_opencv,
 )
-from jaxloc.features.opencv.library import grey_bytes
+from jaxloc.features.opencv.library import gray_bytes
 
 __all__ = ["AKAZE", "FAST", "KAZE", "ORB", "SIFT", "Harris", "ShiTomasi", "detect"]
 
@@ -37,7 +37,7 @@ def detect(
 
     Args:
         kind: The detector: `ORB()`, `SIFT()`, `FAST()`, `Harris()`, `ShiTomasi()`, `KAZE()` or `AKAZE()`.
-        image: Grey image: bytes, or other numbers as grey levels 0-255 (0-1 if no value exceeds 1).
+        image: Gray image: bytes, or other numbers as gray levels 0-255 (0-1 if no value exceeds 1).
         capacity: Number of slots.
         grid: Cells as (rows, columns); `(1, 1)` takes the strongest of the whole image.
         mask: True where keypoints may lie.
@@ -64,7 +64,7 @@ def detect(
         raise ValueError(f"detect: capacity {capacity} and grid {grid} must be positive.")
     if mask is not None and tuple(mask.shape) != tuple(image.shape):
         raise ValueError(f"detect: the mask has shape {mask.shape}, the image {image.shape}; give one value a pixel.")
-    pixels = grey_bytes(image)
+    pixels = gray_bytes(image)
     # Some detectors of OpenCV raise on images of a few pixels, none finds anything there.
     if min(pixels.shape) < 3:
         found = from_opencv(())

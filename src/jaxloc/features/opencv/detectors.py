@@ -51,7 +51,7 @@ class ORB(AbstractFeature):
     Attributes:
         scale_factor: Ratio of neighboring pyramid levels.
         levels: Number of pyramid levels.
-        fast_threshold: Least contrast of a corner, grey levels.
+        fast_threshold: Least contrast of a corner, gray levels.
         patch_size: Side of the described patch, px; the border of this width stays empty.
 
     References:
@@ -167,7 +167,7 @@ class FAST(AbstractDetector):
     """Segment-test corners at one scale: the cheapest detector.
 
     Attributes:
-        threshold: Least contrast between the center and its circle, grey levels.
+        threshold: Least contrast between the center and its circle, gray levels.
 
     References:
         Rosten and Drummond, "Machine learning for high-speed corner detection" (2006).

@@ -46,15 +46,15 @@ def create(name: str, **options):
     )
 
 
-def grey_bytes(image: Num[np.ndarray | Array, "h w"]) -> np.ndarray:
-    """The image as OpenCV's feature detectors want it: 8-bit grey, contiguous.
+def gray_bytes(image: Num[np.ndarray | Array, "h w"]) -> np.ndarray:
+    """The image as OpenCV's feature detectors want it: 8-bit gray, contiguous.
 
     Args:
-        image: Bytes as they are; other numbers as grey levels 0-255, or 0-1 if no value exceeds 1.
+        image: Bytes as they are; other numbers as gray levels 0-255, or 0-1 if no value exceeds 1.
 
     Example:
         >>> import numpy as np
-        >>> grey_bytes(np.array([[0.0, 127.6, 300.0]])).tolist()
+        >>> gray_bytes(np.array([[0.0, 127.6, 300.0]])).tolist()
         [[0, 128, 255]]
     """
     pixels = np.asarray(image)

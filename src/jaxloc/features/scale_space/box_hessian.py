@@ -19,8 +19,8 @@ class BoxHessian(eqx.Module):
     """Responses of an octave.
 
     Attributes:
-        determinant: of the Hessian, squared grey levels; one layer a size of the filter.
-        trace: of the Hessian, grey levels; positive on dark blobs.
+        determinant: of the Hessian, squared gray levels; one layer a size of the filter.
+        trace: of the Hessian, gray levels; positive on dark blobs.
         step: distance of two samples, px.
     """
 
@@ -61,10 +61,10 @@ def box_hessian(image: Float[Array, "h w"], *, octave: int = 0, weight: float = 
     """Second derivatives of a Gaussian by boxes: ``det = D_uu D_vv - (w D_uv)^2``, every filter divided by its area.
 
     The three lobes of D_uu lie side by side, a third of the side wide; the four of D_uv leave the middle row and column
-    out. The picture is continued by its border.
+    out. The image is continued by its border.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         octave: from zero; sizes of `filter_sizes`, every ``2^octave``-th pixel. Static.
         weight: w, which makes up for the boxes: ratio of the Frobenius norms of the filters to those of Gaussians.
 
@@ -123,7 +123,7 @@ def _derivatives(
 
 
 def octaves_that_fit(shape: tuple[int, int], most: int) -> int:
-    """Octaves whose largest filter lies within the picture somewhere, at least one.
+    """Octaves whose largest filter lies within the image somewhere, at least one.
 
     Example:
         >>> octaves_that_fit((128, 200), 4), octaves_that_fit((640, 480), 4)

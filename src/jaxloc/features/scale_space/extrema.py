@@ -27,7 +27,7 @@ class ExtremumTest(eqx.Module):
 
     Attributes:
         least_value: least absolute response between samples; half of it at a sample.
-        edge_ratio: greatest ratio of principal curvatures in the picture.
+        edge_ratio: greatest ratio of principal curvatures in the image.
         border: width of the margin without extrema, samples.
         minima: whether minima count as well as maxima.
         flat: each layer by itself, the first and last too: extrema among 8 neighbors, which stay in their layer.
@@ -141,7 +141,7 @@ def _cubes(stack: Float[Array, "s h w"], place: Int[Array, "n 3"]) -> list[list[
 
 
 def _vertex(cubes: list[list[list[Array]]], flat: bool) -> tuple[Array, Array, tuple[Array, Array, Array]]:
-    """Offset of the paraboloid's vertex, the slope at the middle, and the second derivatives in the picture."""
+    """Offset of the paraboloid's vertex, the slope at the middle, and the second derivatives in the image."""
     middle = cubes[1][1][1]
     slope_s = 0.5 * (cubes[2][1][1] - cubes[0][1][1])
     slope_v = 0.5 * (cubes[1][2][1] - cubes[1][0][1])

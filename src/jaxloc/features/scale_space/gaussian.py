@@ -1,4 +1,4 @@
-"""The Gaussian scale space: a picture at every blur, and what stands out at each."""
+"""The Gaussian scale space: an image at every blur, and what stands out at each."""
 
 import math
 
@@ -11,12 +11,12 @@ from jaxloc.images.gradients import smooth
 
 
 class Octave(eqx.Module):
-    """Layers of one sampling of a picture.
+    """Layers of one sampling of an image.
 
     Attributes:
-        layers: the picture at growing blur, one a layer, grey levels.
+        layers: the image at growing blur, one a layer, gray levels.
         differences: of neighboring layers, the wider less the narrower.
-        step: distance of two pixels of the octave, px of the picture.
+        step: distance of two pixels of the octave, px of the image.
     """
 
     layers: Float[Array, "s h w"]
@@ -30,8 +30,8 @@ class ScaleSpace(eqx.Module):
     Attributes:
         octave_layers: layers in which a scale doubles (three more are computed for the extrema).
         sigma: blur of the first layer, px of its octave.
-        camera_sigma: blur that the picture has already, px.
-        doubled: begin with the picture at twice its size: four times as many points, and four times the time.
+        camera_sigma: blur that the image has already, px.
+        doubled: begin with the image at twice its size: four times as many points, and four times the time.
         least_side: shorter side of the last octave, px.
 
     References:
@@ -62,11 +62,11 @@ def laplacian(image: Float[Array, "h w"], sigma: float) -> Float[Array, "h w"]:
     sampled Gaussian, in separable passes.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         sigma: blur, px; static.
 
     Returns:
-        Grey levels; negative on bright blobs. For a disc of radius r it is least at ``sigma = r / sqrt(2)``.
+        Gray levels; negative on bright blobs. For a disc of radius r it is least at ``sigma = r / sqrt(2)``.
 
     References:
         Lindeberg, "Feature detection with automatic scale selection", IJCV 1998; thesis eq. 2.28 (whose Gaussian lacks
@@ -104,7 +104,7 @@ def difference_of_gaussians(image: Float[Array, "h w"], sigma: float, ratio: flo
     The heat equation ``dG / dsigma = sigma laplace G`` says why.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         sigma: smaller blur, px; static.
         ratio: k, greater than one; static.
 
@@ -125,7 +125,7 @@ def _reach(sigma: float, shape: tuple[int, ...]) -> int:
 
 
 def double(image: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
-    """The picture at twice its size, linearly between pixels: pixel (u, v) lands on (2 u, 2 v)."""
+    """The image at twice its size, linearly between pixels: pixel (u, v) lands on (2 u, 2 v)."""
 
     def along(values: Float[Array, "n m"]) -> Float[Array, "n2 m"]:
         later = jnp.concatenate([values[1:], values[-1:]])
@@ -136,10 +136,10 @@ def double(image: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
 
 @eqx.filter_jit
 def octaves(image: Float[Array, "h w"], options: ScaleSpace) -> tuple[Octave, ...]:
-    """The octaves of a picture, finest first.
+    """The octaves of an image, finest first.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         options: sampling of the scales.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The nonlinear scale space: a picture at every time of a diffusion that stops at edges, and its determinant."""
+"""The nonlinear scale space: an image at every time of a diffusion that stops at edges, and its determinant."""
 
 import math
 from abc import abstractmethod
@@ -37,7 +37,7 @@ class Scheme(eqx.Module):
 
     @abstractmethod
     def advance(self, image: Float[Array, "h w"], conductance: Float[Array, "h w"], steps: Array) -> Array:
-        """The picture after the steps."""
+        """The image after the steps."""
 
 
 class Splitting(Scheme):
@@ -69,13 +69,13 @@ class DiffusedScaleSpace(eqx.Module):
     """How a nonlinear scale space is sampled.
 
     Attributes:
-        octaves: most octaves, each twice the blur of the last; as many as the picture has room for.
+        octaves: most octaves, each twice the blur of the last; as many as the image has room for.
         layers: layers in which a scale doubles.
         sigma: blur of the first layer, px.
         halved: sample each octave by half of the last (A-KAZE); else all at full size (KAZE).
         scheme: of integration.
         conductivity: where the diffusion stops.
-        percentile: of the picture's gradients, which divides edges from noise.
+        percentile: of the image's gradients, which divides edges from noise.
         reach: of derivatives, blurs; half of a keypoint's size.
 
     References:
@@ -117,14 +117,14 @@ class DiffusedScaleSpace(eqx.Module):
 
 
 class Stack(eqx.Module):
-    """Layers of one sampling of a picture.
+    """Layers of one sampling of an image.
 
     Attributes:
-        layers: the diffused picture, grey levels.
-        right: derivative along rows over the layer's reach, grey levels a pixel of the stack.
+        layers: the diffused image, gray levels.
+        right: derivative along rows over the layer's reach, gray levels a pixel of the stack.
         down: along columns.
-        determinant: of the Hessian times the fourth power of the reach, squared grey levels.
-        step: distance of two pixels of the stack, px of the picture.
+        determinant: of the Hessian times the fourth power of the reach, squared gray levels.
+        step: distance of two pixels of the stack, px of the image.
     """
 
     layers: Float[Array, "s h w"]
@@ -136,10 +136,10 @@ class Stack(eqx.Module):
 
 @eqx.filter_jit
 def stacks(image: Float[Array, "h w"], options: DiffusedScaleSpace) -> tuple[Stack, ...]:
-    """The nonlinear scale space of a picture, finest stack first.
+    """The nonlinear scale space of an image, finest stack first.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         options: sampling, scheme and conductivity.
 
     Returns:
@@ -199,7 +199,7 @@ def _derivatives(layers: Float[Array, "s h w"], wanted: list[float]) -> tuple[Ar
 
 
 def _scharr(image: Array, reach: Int[Array, ""], margin: int, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Derivatives between samples `reach` apart on both sides of the inner part of a picture."""
+    """Derivatives between samples `reach` apart on both sides of the inner part of an image."""
 
     def at(down: int, right: int) -> Array:
         return lax.dynamic_slice(image, (margin + down * reach, margin + right * reach), shape)
@@ -216,7 +216,7 @@ class Samples(NamedTuple):
     """All layers of all stacks, one after the other, and where each lies.
 
     Attributes:
-        values: grey level and both derivatives.
+        values: gray level and both derivatives.
         start: first entry of each (stack, layer).
         shape: (rows, columns) of each stack.
     """
@@ -256,7 +256,7 @@ class Seat(NamedTuple):
 
 
 def seat_of(samples: Samples, uv: Array, sigma: Float[Array, " n"], options: DiffusedScaleSpace) -> Seat:
-    """The layer whose blur is nearest to sigma (px of the picture)."""
+    """The layer whose blur is nearest to sigma (px of the image)."""
     number, several = samples.start.shape
     level = options.layers * jnp.log2(jnp.maximum(lax.stop_gradient(sigma), 1e-3) / options.sigma)
     stack = jnp.clip(jnp.floor((level - 0.5) / options.layers), 0, number - 1).astype(jnp.int32)

@@ -1,4 +1,4 @@
-"""The borders of a lane in one picture, where a prediction says to look."""
+"""The borders of a lane in one image, where a prediction says to look."""
 
 import equinox as eqx
 import jax
@@ -18,10 +18,10 @@ class Trust(eqx.Module):
 
     Args:
         snr: least response, in its own standard deviations.
-        contrast: least contrast, grey levels.
+        contrast: least contrast, gray levels.
         gate: greatest distance from the prediction, in standard deviations of that distance.
         paint: standard deviation of the place of paint on the road, m,
-        pixels: and of the picture of an edge, px: what an edge is never better known than.
+        pixels: and of the image of an edge, px: what an edge is never better known than.
     """
 
     snr: float = 5.0
@@ -39,7 +39,7 @@ class Borders(eqx.Module):
         found: which were.
         sensor: what tells a filter how the columns follow from the state.
         predicted: columns by the prediction, px.
-        visible: which windows are in the picture.
+        visible: which windows are in the image.
     """
 
     columns: Float[Array, " n"]
@@ -65,7 +65,7 @@ def measure(
     out [K-31].
 
     Args:
-        image: grey levels.
+        image: gray levels.
         ground: the camera with its mean pitch.
         predicted: a `RoadState` and its covariance.
         windows: where to look; `Windows()` by default.

@@ -16,7 +16,7 @@ class EdgeDetector(eqx.Module):
 
     @abstractmethod
     def contrast(self, kernel: Float[Array, " k"], offsets: Float[Array, " k"]) -> Float[Array, ""]:
-        """Response to an edge of one grey level."""
+        """Response to an edge of one gray level."""
 
 
 class LightStripe(EdgeDetector):
@@ -71,7 +71,7 @@ class Edge(eqx.Module):
     Attributes:
         place: distance to the left of the middle of the profile, m.
         variance: of that, m^2: noise of the response's slope over its bend.
-        contrast: of the edge, grey levels.
+        contrast: of the edge, gray levels.
         snr: response against its own standard deviation.
         ok: whether there is a peak inside the profile.
     """
@@ -98,7 +98,7 @@ def find_edge(
     ``var = var(r') / r''^2`` [K-31].
 
     Args:
-        profile: means of grey levels, from left to right.
+        profile: means of gray levels, from left to right.
         variance: of a mean; they are taken to be independent.
         reach: lateral distance from the middle of the profile to its ends, m.
         within: only peaks no farther from the middle count, m; all by default.

@@ -1,4 +1,4 @@
-"""The clothoid as a state: how it moves on with the vehicle, and where its borders appear in the picture."""
+"""The clothoid as a state: how it moves on with the vehicle, and where its borders appear in the image."""
 
 from typing import Any
 
@@ -46,7 +46,7 @@ class Ride(eqx.Module):
     """What one step of the filter is told.
 
     Args:
-        dt: s since the last picture.
+        dt: s since the last image.
         speed: of the vehicle, m/s.
         yaw_rate: counter-clockwise, rad/s.
         yaw_known: False to take the vehicle to follow the lane.
@@ -117,11 +117,11 @@ class LaneMotion(Motion):
 
 
 class BorderSensor(Sensor):
-    """Columns in which borders cross rows of the picture.
+    """Columns in which borders cross rows of the image.
 
     Args:
         ground: the camera with its mean pitch.
-        rows: of the picture, px.
+        rows: of the image, px.
         ranges: near which the rows show ground, m: where the search for the exact ones begins.
         sides: 1 for the left border, -1 for the right one.
         variances: of the measured columns, px^2.

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc.images.interpolation import Bilinear, sample_components
-from jaxloc.images.normalization import as_grey
+from jaxloc.images.normalization import as_gray
 from jaxloc.lanes.dickmanns.model import RoadState
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.ground_camera import GroundCamera
 
 
 class Windows(eqx.Module):
-    """Where along each border the picture is read.
+    """Where along each border the image is read.
 
     Args:
         near: range of the first window, m.
@@ -59,12 +59,12 @@ class Windows(eqx.Module):
 
 
 class ColumnSums(eqx.Module):
-    """Grey levels summed along the predicted border.
+    """Gray levels summed along the predicted border.
 
     Attributes:
         profile: means by window and lateral position, from left to right.
         variance: of a mean, by window.
-        seen: whether all of the window is in the picture.
+        seen: whether all of the window is in the image.
     """
 
     profile: Float[Array, "n columns"]
@@ -76,13 +76,13 @@ class ColumnSums(eqx.Module):
 def sum_columns(
     image: Num[Array, "h w"] | Any, ground: GroundCamera, state: RoadState, windows: Windows | None = None
 ) -> ColumnSums:
-    """Sums grey levels along the predicted direction of the borders: what is constant grows, what is random cancels.
+    """Sums gray levels along the predicted direction of the borders: what is constant grows, what is random cancels.
 
     The samples of a window lie on parallels to the predicted border on the ground, so that they follow its direction in
-    the picture, its bend, and the perspective.
+    the image, its bend, and the perspective.
 
     Args:
-        image: grey levels.
+        image: gray levels.
         ground: the camera with its mean pitch.
         state: predicted.
         windows: where to read; `Windows()` by default.
@@ -104,7 +104,7 @@ def sum_columns(
         ((24, 61), 9.0)
     """
     windows = Windows() if windows is None else windows
-    pixels = as_grey(image)
+    pixels = as_gray(image)
     finite = jnp.isfinite(pixels)
     pixels = jnp.where(finite, pixels, 0.0)
     state_camera, (ahead, length) = state.camera(ground), windows.ranges()

@@ -19,7 +19,7 @@ from jaxloc.solvers.robust_kernels import Loss
 
 
 class LaneState(eqx.Module):
-    """Where a vehicle is in its lane, by one picture.
+    """Where a vehicle is in its lane, by one image.
 
     Attributes:
         estimate: a `LaneFit` with its covariance, in the order offset, heading, curvature, pitch.

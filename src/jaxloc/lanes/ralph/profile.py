@@ -43,9 +43,9 @@ class Straightened(eqx.Module):
     """A view in coordinates of the lane: each row brought to zero mean and unit variance.
 
     Attributes:
-        values: normalized grey levels; row by range, column by lateral position in the lane; zero where not seen.
+        values: normalized gray levels; row by range, column by lateral position in the lane; zero where not seen.
         weight: 1 where they are seen, 0 where not, with a ramp between, so that nothing jumps as a lane moves; 0 in a
-            row that shows too little, or nothing but one grey level.
+            row that shows too little, or nothing but one gray level.
     """
 
     values: Float[Array, "rows columns"]
@@ -61,7 +61,7 @@ class Straightened(eqx.Module):
 
 
 class Profile(eqx.Module):
-    """Normalized grey levels across the road.
+    """Normalized gray levels across the road.
 
     Attributes:
         values: by lateral position, from left to right; zero where unknown.
@@ -90,7 +90,7 @@ def straighten(view: GroundView, fit: LaneFit, left: Float[Array, " columns"]) -
 def shift_rows(
     view: GroundView, fit: LaneFit, left: Float[Array, " columns"]
 ) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
-    """Grey levels of a view at lateral positions in the lane (cubic along rows), and the weight of what is seen."""
+    """Gray levels of a view at lateral positions in the lane (cubic along rows), and the weight of what is seen."""
     ahead, scale = view.true_range(fit.pitch)
     center = fit.lane().center(ahead)
     column = view.grid.column((left[None, :] + center[:, None]) / scale[:, None])

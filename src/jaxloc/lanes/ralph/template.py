@@ -14,7 +14,7 @@ from jaxloc.poses.lie_group import as_floats
 
 
 class Template(eqx.Module):
-    """Normalized grey levels across a lane, by lateral position.
+    """Normalized gray levels across a lane, by lateral position.
 
     Attributes:
         values: zero mean and unit variance where known, zero elsewhere.
@@ -95,10 +95,10 @@ class Adaptation(eqx.Module):
 
     @abstractmethod
     def adapt(self, template: Template, view: GroundView, fit: LaneFit, ok: Bool[Array, ""]) -> Template:
-        """The template for the next picture.
+        """The template for the next image.
 
         Args:
-            template: that of this picture.
+            template: that of this image.
             view: the road from above.
             fit: lane in it: the one that was found, or for a while the predicted one where none was, as on a road
                 whose looks change at once.
@@ -118,7 +118,7 @@ class Blended(Adaptation):
     """Blends in what is seen now by a small share [K-43].
 
     Args:
-        rate: share by picture, 0 to 1.
+        rate: share by image, 0 to 1.
     """
 
     rate: Float[Array, ""]
@@ -127,7 +127,7 @@ class Blended(Adaptation):
         (self.rate,) = as_floats(rate)
 
     def adapt(self, template: Template, view: GroundView, fit: LaneFit, ok: Bool[Array, ""]) -> Template:
-        """The template with a share of the picture."""
+        """The template with a share of the image."""
         fresh = capture(view, fit, left=template.left)
         return _keep_unless(ok, blend(template, fresh, self.rate.astype(template.values.dtype)), template)
 
@@ -137,7 +137,7 @@ class Predictive(Adaptation):
 
     Args:
         near: range from which on rows count, m.
-        rate: share by picture, 0 to 1: 1 forgets all that went before.
+        rate: share by image, 0 to 1: 1 forgets all that went before.
     """
 
     near: Float[Array, ""]

@@ -1,7 +1,7 @@
 """What trackers assume of ready detections: how they err and score, where targets appear, and when they leave.
 
 A measurement is a place and the detector's score, one vector: (x, y, z, score) of a solid in the world, or (center x,
-center y, width, height, score) of a box in a picture. The state of a target is that and its rates.
+center y, width, height, score) of a box in an image. The state of a target is that and its rates.
 """
 
 from typing import Any
@@ -42,7 +42,7 @@ class Noise(eqx.Module):
 
 
 class Frame(eqx.Module):
-    """What a detector made of a picture.
+    """What a detector made of an image.
 
     Attributes:
         values: measurements.
@@ -54,7 +54,7 @@ class Frame(eqx.Module):
 
 
 class Step(eqx.Module):
-    """From one picture to the next.
+    """From one image to the next.
 
     Attributes:
         dt: s.

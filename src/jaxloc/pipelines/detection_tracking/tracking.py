@@ -1,4 +1,4 @@
-"""Tracks from ready detections: of solids in the world, or of boxes in pictures.
+"""Tracks from ready detections: of solids in the world, or of boxes in images.
 
 One jitted scan over all frames, then a look at each track: it is spoken of once it was likely to be there, with a
 high score, often enough. What is false again and again in the same place has low scores again and again, and is never

@@ -1,7 +1,7 @@
-"""Mosaics of floors from pictures and odometry, and localization in them.
+"""Mosaics of floors from images and odometry, and localization in them.
 
-Each picture is laid upon those before it; where the path comes back to a place, pictures are laid upon those taken
-there earlier; a pose graph makes all of it agree; then the pictures are blended to one map.
+Each image is laid upon those before it; where the path comes back to a place, images are laid upon those taken
+there earlier; a pose graph makes all of it agree; then the images are blended to one map.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,22 +26,22 @@ from jaxloc.poses.planar import compose_poses
 from jaxloc.sensors.ground_camera import GroundCamera
 from jaxloc.slam.mosaic import FloorView, Patch, Raster, Rectifier, blend, enclose, fit_falloff, tracking
 
-_FEWEST_TO_FIT = 10  # pictures whose mean is even enough to show the falloff of the light
+_FEWEST_TO_FIT = 10  # images whose mean is even enough to show the falloff of the light
 _MOST_PIXELS = 200_000_000
 
 
 class FloorMosaic(eqx.Module):
-    """A mosaic and the path along which its pictures were taken.
+    """A mosaic and the path along which its images were taken.
 
     Attributes:
         mosaic: the map.
         view: camera and raster that it was made with.
-        poses: (x, y, heading) of each picture, m and rad.
+        poses: (x, y, heading) of each image, m and rad.
         covariances: of the poses, in their tangents.
-        used: which pictures are in the mosaic.
+        used: which images are in the mosaic.
         before_closure: poses by neighbors alone.
         pairs: all registrations that were tried.
-        gains: exposure of each picture.
+        gains: exposure of each image.
         ok: whether the pose graph was solved.
     """
 
@@ -57,7 +57,7 @@ class FloorMosaic(eqx.Module):
 
     @property
     def left_out(self) -> tuple[int, ...]:
-        """Numbers of the pictures that overlap no other, or show nothing."""
+        """Numbers of the images that overlap no other, or show nothing."""
         return tuple(int(number) for number in np.flatnonzero(~self.used))
 
 
@@ -86,23 +86,23 @@ def make_mosaic(
     start: Float64[np.ndarray, "3"] | None = None,
     config: Config | None = None,
 ) -> FloorMosaic:
-    """Joins pictures of a floor to one map.
+    """Joins images of a floor to one map.
 
     Args:
-        frames: grey pictures of one size, bytes or numbers (nan where a pixel is not to be used).
-        odometry: measured motion (x, y, heading) from each picture to the next, m and rad: x to the top of the picture,
+        frames: gray images of one size, bytes or numbers (nan where a pixel is not to be used).
+        odometry: measured motion (x, y, heading) from each image to the next, m and rad: x to the top of the image,
             y to its left.
         ground: camera with lens and height, looking down.
         covariances: of the motions, in their tangents; by `Config.odometry` if not given.
-        start: pose of the first picture; the origin by default.
+        start: pose of the first image; the origin by default.
         config: options.
 
     Returns:
-        The mosaic. Pictures that overlap no other are left out, and named in `left_out`; their poses are those of the
+        The mosaic. Images that overlap no other are left out, and named in `left_out`; their poses are those of the
         odometry.
 
     Raises:
-        ValueError: there are fewer than two pictures, of different sizes, or another number of motions.
+        ValueError: there are fewer than two images, of different sizes, or another number of motions.
 
     References:
         [K-83, K-84, K-85]; Kelly, "Mobile robot localization from large-scale appearance mosaics", IJRR 2000.
@@ -138,17 +138,17 @@ def localize(
     *,
     config: Config | None = None,
 ) -> Iterator[Tracked]:
-    """Follows a camera on a later drive, a picture at a time.
+    """Follows a camera on a later drive, an image at a time.
 
     Args:
         built: the mosaic, or its map and view.
-        frames: grey pictures.
-        odometry: measured motion from each picture to the next.
+        frames: gray images.
+        odometry: measured motion from each image to the next.
         start: predicted pose of the first, in the frame of the mosaic.
         config: options.
 
     Yields:
-        The pose at each picture; where it is not found, the pose predicted by odometry from the last.
+        The pose at each image; where it is not found, the pose predicted by odometry from the last.
     """
     config = Config() if config is None else config
     mosaic, view = (built.mosaic, built.view) if isinstance(built, FloorMosaic) else built
@@ -167,7 +167,7 @@ def localize(
 
 
 def make_view(images: np.ndarray, ground: GroundCamera, config: Config) -> FloorView:
-    """The view of whole pictures, with the falloff of the light measured from them if they are enough."""
+    """The view of whole images, with the falloff of the light measured from them if they are enough."""
     view = FloorView.of(ground, images.shape[1:], resolution=config.resolution or None, black=config.black)
     if len(images) < _FEWEST_TO_FIT:
         return view
@@ -175,7 +175,7 @@ def make_view(images: np.ndarray, ground: GroundCamera, config: Config) -> Floor
 
 
 def tracking_rectifier(view: FloorView, config: Config) -> Rectifier:
-    """What tracking looks at: the middle of the pictures."""
+    """What tracking looks at: the middle of the images."""
     part = [length - 2 * round(0.5 * (1.0 - config.tracking) * length) for length in view.raster.shape]
     return view.part((part[0], part[1])).rectifier()
 
@@ -183,11 +183,11 @@ def tracking_rectifier(view: FloorView, config: Config) -> Rectifier:
 def _checked(frames: Any, odometry: Any) -> tuple[np.ndarray, np.ndarray]:
     shapes = {np.asarray(frame).shape for frame in frames}
     if len(frames) < 2 or len(shapes) > 1 or len(next(iter(shapes))) != 2:
-        raise ValueError(f"make_mosaic: give two or more grey pictures of one size; got {len(frames)} of {shapes}.")
+        raise ValueError(f"make_mosaic: give two or more gray images of one size; got {len(frames)} of {shapes}.")
     odometry = np.asarray(odometry, np.float64)
     if odometry.shape != (len(frames) - 1, 3):
         raise ValueError(
-            f"make_mosaic: {len(frames)} pictures need {len(frames) - 1} motions (x, y, heading) between them; "
+            f"make_mosaic: {len(frames)} images need {len(frames) - 1} motions (x, y, heading) between them; "
             f"got an array of shape {odometry.shape}."
         )
     if not np.isfinite(odometry).all():

@@ -1,4 +1,4 @@
-"""The path of a camera over a floor: pictures laid upon each other, loops closed by a pose graph."""
+"""The path of a camera over a floor: images laid upon each other, loops closed by a pose graph."""
 
 from typing import Any
 
@@ -23,10 +23,10 @@ class OdometryNoise(eqx.Module):
     Attributes:
         drive: m at 1 m of way, along it.
         side: m at 1 m of way, across it.
-        idle: m a picture.
+        idle: m an image.
         turn_drive: rad at 1 m of way.
         turn_turn: rad at a turn of 1 rad.
-        turn_idle: rad a picture.
+        turn_idle: rad an image.
     """
 
     drive: float = 0.003
@@ -42,15 +42,15 @@ class Config(eqx.Module):
 
     Attributes:
         odometry: its noise; only used where covariances are not given.
-        neighbors: pictures before each that it is laid upon.
-        closures: earlier places that each picture is laid upon at most.
+        neighbors: images before each that it is laid upon.
+        closures: earlier places that each image is laid upon at most.
         rounds: how often loops are looked for with better and better poses.
-        min_overlap: part of a picture that must be predicted to lie on another.
+        min_overlap: part of an image that must be predicted to lie on another.
         gate: probability that a right registration is taken, by the odometry's covariance.
         kernel: of the robust loss on registrations, in sigmas.
-        resolution: edge of a pixel of the mosaic, m; 0 for that of the pictures.
-        black: grey level of darkness.
-        tracking: part of the picture's edges that is used to track in the finished mosaic.
+        resolution: edge of a pixel of the mosaic, m; 0 for that of the images.
+        black: gray level of darkness.
+        tracking: part of the image's edges that is used to track in the finished mosaic.
     """
 
     odometry: OdometryNoise = OdometryNoise()
@@ -76,14 +76,14 @@ class Config(eqx.Module):
 
 
 class Pair(eqx.Module):
-    """One picture laid upon another.
+    """One image laid upon another.
 
     Attributes:
-        first: number of the earlier picture.
+        first: number of the earlier image.
         second: number of the later one.
         motion: ``T_first_second`` as (x, y, heading), m and rad.
         covariance: in its tangent.
-        share: part of the second picture that lies on the first.
+        share: part of the second image that lies on the first.
         closes: whether it closes a loop.
         ok: whether it was taken.
         overlap: exposures of both.
@@ -113,7 +113,7 @@ class PathBuilder:
         self._corners = np.asarray(patches.raster.corners(), np.float64)
 
     def follow(self) -> None:
-        """Each picture upon those before it, the poses carried along."""
+        """Each image upon those before it, the poses carried along."""
         for number in range(1, self.count):
             self.poses[number] = compose_poses(self.poses[number - 1 : number], self.odometry[number - 1 : number])[0]
             for back in range(1, self.config.neighbors + 1):
@@ -125,7 +125,7 @@ class PathBuilder:
         self.settle()
 
     def close_loops(self) -> None:
-        """Pictures upon those taken long before at the same place, by where both are thought to be."""
+        """Images upon those taken long before at the same place, by where both are thought to be."""
         for number in range(self.count):
             far = range(number - self.config.neighbors)
             shares = {other: self._overlap(other, number) for other in far if (other, number) not in self.tried}
@@ -144,7 +144,7 @@ class PathBuilder:
             motions[slot], spreads[slot], ends[:, slot] = pair.motion, pair.covariance, (pair.first, pair.second)
         valid = jnp.asarray(np.arange(capacity) < len(good))
         found = Edges(jnp.asarray(ends[0]), jnp.asarray(ends[1]), planar(motions), _floats(spreads), valid)
-        # Odometry ties pictures without any overlap to the rest.
+        # Odometry ties images without any overlap to the rest.
         edges = Edges.chain(planar(self.odometry), _floats(self.noise)).join(found)
         rough = optimize(planar(self.poses), edges, loss=GemanMcClure(self.config.kernel)).value
         # A last plain fit of what agrees: the sandwich of a robust one calls a pose exact that one edge alone holds.
@@ -157,7 +157,7 @@ class PathBuilder:
             self.covariances = np.asarray(marginals(fit), np.float64)
 
     def connected(self) -> np.ndarray:
-        """Pictures that registrations tie to the largest group."""
+        """Images that registrations tie to the largest group."""
         group = np.arange(self.count)
         for pair in self.pairs:
             if pair.ok:
@@ -167,7 +167,7 @@ class PathBuilder:
         return (group == largest) & (sizes.max() > 1)
 
     def exposures(self) -> Exposure:
-        """Of all pictures, from the pairs."""
+        """Of all images, from the pairs."""
         good = [pair for pair in self.pairs if pair.ok]
         if not good:
             return Exposure.none(self.count, self.patches.values.dtype)
@@ -179,7 +179,7 @@ class PathBuilder:
         return any(pair.second == number and pair.ok for pair in self.pairs[:-1])
 
     def _reckoned_noise(self, first: int, second: int) -> np.ndarray:
-        """Covariance of the motion between two pictures by odometry, heading carried to the end."""
+        """Covariance of the motion between two images by odometry, heading carried to the end."""
         total = np.zeros((3, 3))
         for number in range(first, second):
             back = pose_of_row(relative_poses(self.odometry[number][None], np.zeros((1, 3)))[0])
@@ -188,7 +188,7 @@ class PathBuilder:
         return total
 
     def _overlap(self, first: int, second: int) -> float:
-        """Part of a picture's middle rows and columns that is predicted to lie on another."""
+        """Part of an image's middle rows and columns that is predicted to lie on another."""
         if not (np.isfinite(self.poses[first]).all() and np.isfinite(self.poses[second]).all()):
             return 0.0
         motion = relative_poses(self.poses[first][None], self.poses[second][None])[0]
@@ -202,7 +202,7 @@ class PathBuilder:
         return float(np.mean(((there >= low) & (there <= high)).all(axis=1)))
 
     def _register(self, first: int, second: int, spread: np.ndarray, *, closes: bool) -> Pair:
-        """Lays a picture upon another; by squares where that fails from the predicted pose."""
+        """Lays an image upon another; by squares where that fails from the predicted pose."""
         self.tried.add((first, second))
         guess = pose_of_row(relative_poses(self.poses[first][None], self.poses[second][None])[0])
         one, other = self._patch(first), self._patch(second)

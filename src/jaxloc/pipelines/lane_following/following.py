@@ -1,4 +1,4 @@
-"""Lane following: where a vehicle is in its lane, picture by picture.
+"""Lane following: where a vehicle is in its lane, image by image.
 
 RALPH starts it, and starts it again where it was lost; Dickmanns' filter tracks the borders; where too little paint
 is seen, the look of the road across carries it on.
@@ -34,14 +34,14 @@ class Config(eqx.Module):
         lane_width_sigma: and its standard deviation, m.
         vehicle_width: for the warning, m.
         speed: m/s.
-        interval: between pictures that have no time, s.
-        sequence: whether pictures without a time are of one drive; each is looked at for itself otherwise.
-        near: range of the nearest windows, m; 0 for what the picture shows.
+        interval: between images that have no time, s.
+        sequence: whether images without a time are of one drive; each is looked at for itself otherwise.
+        near: range of the nearest windows, m; 0 for what the image shows.
         far: range of the farthest ones, m; 0 for 20 m and 1.5 s of driving.
-        rows: of the picture at which borders are told.
-        blend: share of each picture in the template of the road's look.
-        patience: pictures without a lane after which it is searched for anew.
-        pitch_frames: pictures from which an unknown pitch is estimated.
+        rows: of the image at which borders are told.
+        blend: share of each image in the template of the road's look.
+        patience: images without a lane after which it is searched for anew.
+        pitch_frames: images from which an unknown pitch is estimated.
         pitch_sigma: standard deviation of a pitch that was given, rad.
         motion: of the filter.
         trust: in an edge.
@@ -78,33 +78,33 @@ class Config(eqx.Module):
 
 @runtime_checkable
 class Frame(Protocol):
-    """A picture: grey levels, and s since the first one, or None."""
+    """An image: gray levels, and s since the first one, or None."""
 
     @property
-    def grey(self) -> np.ndarray:
-        """Grey levels, 0 to 255."""
+    def gray(self) -> np.ndarray:
+        """Gray levels, 0 to 255."""
         ...
 
     @property
     def time(self) -> float | None:
-        """S since the first picture."""
+        """S since the first image."""
         ...
 
 
 class Step(eqx.Module):
-    """The lane at one picture.
+    """The lane at one image.
 
     Attributes:
-        index: of the picture.
+        index: of the image.
         lane: offset (m), heading (rad), curvature (1/m) and its rate (1/m^2).
         width: of the lane, m.
         pitch: of the camera, rad.
         covariance: of offset, heading, curvature, rate, width and pitch.
         confidence: 0 to 1.
-        ok: whether this picture shows the lane; it is predicted where not.
+        ok: whether this image shows the lane; it is predicted where not.
         source: what showed it: "start", "borders", "template", or "prediction".
         found: windows with an edge, along the left and the right border.
-        rows: of the picture.
+        rows: of the image.
         left: column of the left border in each of them, px,
         right: and of the right one.
         crossing: time to line crossing, s; infinite for none.
@@ -128,11 +128,11 @@ class Step(eqx.Module):
 
 
 class LaneFollower:
-    """Follows a lane through pictures that come one at a time.
+    """Follows a lane through images that come one at a time.
 
     Args:
         ground: the camera over the road, with its mean pitch.
-        shape: rows and columns of the pictures.
+        shape: rows and columns of the images.
         config: options.
         template: what the road looks like across, where it may have no paint; none by default.
         pitch_sigma: how well the pitch is known, rad; that of the options by default.
@@ -174,7 +174,7 @@ class LaneFollower:
         self._index = 0
 
     def follow(self, frame: Frame, *, yaw_rate: float | None = None) -> Step:
-        """Looks at the next picture.
+        """Looks at the next image.
 
         Args:
             frame: of the shape that was told.
@@ -184,11 +184,11 @@ class LaneFollower:
             The lane.
 
         Raises:
-            ValueError: the picture has another shape.
+            ValueError: the image has another shape.
         """
-        if frame.grey.shape != self.shape:
-            raise ValueError(f"The picture has the shape {frame.grey.shape}; the follower was told {self.shape}.")
-        image = jnp.asarray(frame.grey, self._tracker.width.dtype)
+        if frame.gray.shape != self.shape:
+            raise ValueError(f"The image has the shape {frame.gray.shape}; the follower was told {self.shape}.")
+        image = jnp.asarray(frame.gray, self._tracker.width.dtype)
         moved, source = self._look(image, self._ride(frame.time, yaw_rate))
         self._state = moved.state
         ok = bool(moved.ok)
@@ -200,7 +200,7 @@ class LaneFollower:
         return step
 
     def _ride(self, time: float | None, yaw_rate: float | None) -> Ride | None:
-        """What happened since the last picture; None if the last one is of no use."""
+        """What happened since the last image; None if the last one is of no use."""
         alone = time is None and not self.config.sequence
         before, self._time = self._time, time
         if self._index == 0 or alone:
@@ -269,18 +269,18 @@ def follow(
     template: Template | None = None,
     yaw_rates: Iterable[float] | None = None,
 ) -> Iterator[Step]:
-    """Follows a lane through pictures.
+    """Follows a lane through images.
 
     Args:
-        frames: pictures of one shape.
+        frames: images of one shape.
         ground: the camera over the road.
         config: options.
-        pitch_known: False to estimate the pitch from the vanishing point of the first pictures.
+        pitch_known: False to estimate the pitch from the vanishing point of the first images.
         template: what the road looks like across, where it may have no paint.
-        yaw_rates: of the vehicle before each picture, rad/s; None where not known.
+        yaw_rates: of the vehicle before each image, rad/s; None where not known.
 
     Yields:
-        The lane at each picture.
+        The lane at each image.
 
     Example:
         >>> import jaxloc as jl
@@ -299,19 +299,19 @@ def follow(
     follower: LaneFollower | None = None
     for frame in frames:
         if follower is None:
-            shape = (frame.grey.shape[0], frame.grey.shape[1])
+            shape = (frame.gray.shape[0], frame.gray.shape[1])
             follower = LaneFollower(ground, shape, config, template=template, pitch_sigma=sigma)
         yield follower.follow(frame, yaw_rate=next(rates))
 
 
 def level(frames: Iterable[Frame], ground: GroundCamera) -> tuple[Pitch, GroundCamera]:
-    """The pitch that pictures show, and the camera with it.
+    """The pitch that images show, and the camera with it.
 
     Args:
         frames: of a stretch that is straight on the whole.
         ground: the camera; its pitch stays where no vanishing point is found.
     """
-    pitch = estimate_pitch((frame.grey for frame in frames), ground)
+    pitch = estimate_pitch((frame.gray for frame in frames), ground)
     return pitch, eqx.tree_at(lambda g: g.pitch, ground, jnp.asarray(pitch.value, ground.pitch.dtype))
 
 

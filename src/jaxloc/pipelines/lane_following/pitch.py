@@ -1,4 +1,4 @@
-"""The pitch of a camera over a road, from the point where straight borders meet in its pictures."""
+"""The pitch of a camera over a road, from the point where straight borders meet in its images."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from jaxloc.features.opencv.library import grey_bytes, load
+from jaxloc.features.opencv.library import gray_bytes, load
 from jaxloc.sensors.ground_camera import GroundCamera
 
 _MOST_LINES = 240
@@ -33,14 +33,14 @@ class Pitch(eqx.Module):
     ok: bool
 
 
-def estimate_pitch(pictures: Iterable[np.ndarray], ground: GroundCamera, *, most: float = 0.3) -> Pitch:
+def estimate_pitch(images: Iterable[np.ndarray], ground: GroundCamera, *, most: float = 0.3) -> Pitch:
     """Finds the pitch of a camera by the vanishing point of straight lines along the road.
 
-    Straight edges in the lower part of all pictures vote for the point that most of them pass, on both sides of it; a
+    Straight edges in the lower part of all images vote for the point that most of them pass, on both sides of it; a
     direction ``(a, b, 1)`` in the camera that the road's lines share is level when ``tan(pitch) = elevation``.
 
     Args:
-        pictures: grey levels, of a stretch that is straight on the whole.
+        images: gray levels, of a stretch that is straight on the whole.
         ground: the camera; its pitch is not used.
         most: greatest pitch to believe, rad.
 
@@ -56,13 +56,13 @@ def estimate_pitch(pictures: Iterable[np.ndarray], ground: GroundCamera, *, most
         >>> from jaxloc.data.simulate.road.rendering import Road, render
         >>> camera = jl.sensors.Pinhole(250.0, 250.0, 159.5, 100.0)
         >>> seen = jl.sensors.GroundCamera(camera, height=1.3, pitch=0.05)
-        >>> picture = render(Road(), jl.lanes.Lane(0.3, 0.01, 0.0), seen, shape=(240, 320))
-        >>> found = estimate_pitch([picture], jl.sensors.GroundCamera(camera, height=1.3))
+        >>> image = render(Road(), jl.lanes.Lane(0.3, 0.01, 0.0), seen, shape=(240, 320))
+        >>> found = estimate_pitch([image], jl.sensors.GroundCamera(camera, height=1.3))
         >>> bool(abs(found.value - 0.05) < 0.005), found.ok
         (True, True)
     """
     level = eqx.tree_at(lambda g: g.pitch, ground, jnp.zeros_like(ground.pitch))
-    lines = [_road_lines(picture, level) for picture in pictures]
+    lines = [_road_lines(image, level) for image in images]
     segments = np.concatenate([*lines, np.zeros((0, 4))])
     length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
     order = np.argsort(-length)[:_MOST_LINES]
@@ -83,12 +83,12 @@ def estimate_pitch(pictures: Iterable[np.ndarray], ground: GroundCamera, *, most
     return Pitch(float(np.arctan(point[1])), sigma, share, True)
 
 
-def _road_lines(picture: np.ndarray, level: GroundCamera) -> Float64[np.ndarray, "n 4"]:
+def _road_lines(image: np.ndarray, level: GroundCamera) -> Float64[np.ndarray, "n 4"]:
     """Straight edges: ends (left, up) of each in a camera without lens, roll and pitch, in focal lengths."""
     cv2 = load()
-    grey = grey_bytes(picture)
-    rows, columns = grey.shape
-    edges = cv2.Canny(cv2.GaussianBlur(grey, (5, 5), 0), 40, 120)
+    gray = gray_bytes(image)
+    rows, columns = gray.shape
+    edges = cv2.Canny(cv2.GaussianBlur(gray, (5, 5), 0), 40, 120)
     edges[: int(0.45 * rows)] = 0
     found = cv2.HoughLinesP(edges, 1, np.pi / 360, 18, minLineLength=columns / 40, maxLineGap=columns / 160)
     if found is None:

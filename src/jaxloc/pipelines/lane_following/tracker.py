@@ -75,9 +75,9 @@ class Moved(eqx.Module):
 
     Attributes:
         state: after it.
-        ok: whether the picture was used.
+        ok: whether the image was used.
         found: windows along the left and the right border with an edge in them.
-        visible: windows in the picture.
+        visible: windows in the image.
         confidence: 0 to 1.
     """
 
@@ -93,7 +93,7 @@ def begin(tracker: Tracker, image: Float[Array, "h w"], bank: ralph.Template) ->
 
     Args:
         tracker: what all steps share.
-        image: grey levels.
+        image: gray levels.
         bank: painted templates, see `painted_bank`.
 
     Returns:
@@ -102,7 +102,7 @@ def begin(tracker: Tracker, image: Float[Array, "h w"], bank: ralph.Template) ->
     state = _propose(tracker, image, bank)
     for number in range(_PASSES):
         moved = settle(tracker, state, image)
-        # The same picture again is no new evidence: the prior moves, and stays a prior.
+        # The same image again is no new evidence: the prior moves, and stays a prior.
         state = _start(tracker, moved.state.mean, jnp.asarray(0.5 ** (number + 1), image.dtype))
     ok = moved.ok & (jnp.min(moved.found) >= 2.0)
     return eqx.tree_at(lambda m: (m.ok, m.confidence), moved, (ok, jnp.where(ok, moved.confidence, 0.0)))
@@ -151,8 +151,8 @@ def settle(tracker: Tracker, predicted: GaussianState, image: Float[Array, "h w"
 
     Args:
         tracker: what all steps share.
-        predicted: for this picture.
-        image: grey levels.
+        predicted: for this image.
+        image: gray levels.
     """
     borders = dickmanns.measure(image, tracker.ground, predicted.gaussian(), tracker.windows, trust=tracker.trust)
     count = jnp.sum(borders.found.reshape(2, -1), axis=1).astype(borders.columns.dtype)
@@ -173,8 +173,8 @@ def follow_template(
 
     Args:
         tracker: what all steps share.
-        predicted: for this picture.
-        image: grey levels.
+        predicted: for this image.
+        image: gray levels.
         template: what the road looked like so far.
     """
     mean: RoadState = predicted.mean
@@ -198,7 +198,7 @@ def recognize(tracker: Tracker, image: Float[Array, "h w"], template: ralph.Temp
 
     Args:
         tracker: what all steps share.
-        image: grey levels.
+        image: gray levels.
         template: what the road looks like.
     """
     seen = _see(tracker, image, _alone(template), ralph.Hypotheses.around(_nothing(tracker)))
@@ -217,7 +217,7 @@ def _alone(template: ralph.Template) -> ralph.Template:
 
 @eqx.filter_jit
 def predict(tracker: Tracker, state: GaussianState, ride: Ride) -> GaussianState:
-    """The state at the next picture."""
+    """The state at the next image."""
     return _idle(tracker).predict(state, ride)
 
 
@@ -234,7 +234,7 @@ def adapt(
 
 @eqx.filter_jit
 def border_columns(tracker: Tracker, state: RoadState, rows: Float[Array, " r"]) -> Float[Array, "2 r"]:
-    """Columns of the left and right border in rows of the picture."""
+    """Columns of the left and right border in rows of the image."""
     camera = state.camera(tracker.ground)
     ranges, _ = camera.to_ground_components(jnp.full_like(rows, camera.camera.cx), rows)
     ones = jnp.ones_like(rows)

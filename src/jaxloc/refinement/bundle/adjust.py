@@ -41,7 +41,7 @@ def adjust(
     and weak chains may be flagged as undetermined: use float64 for covariances of more than some ten poses in a row.
 
     Args:
-        model: the camera, or the rig, that took every picture.
+        model: the camera, or the rig, that took every image.
         start: poses and points to start from. A point with a start that is not finite is left out.
         observations: what was seen.
         gauge: what holds the bundle in place; by default the first camera is fixed, which suits a stereo rig. For a

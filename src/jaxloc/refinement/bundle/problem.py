@@ -162,7 +162,7 @@ class BundleProblem(eqx.Module):
     """``sum rho(|W (h(T_c^-1 X_p) - z)|^2)`` over observations, and the cost of the gauge.
 
     Attributes:
-        model: the camera or stereo rig that took every picture.
+        model: the camera or stereo rig that took every image.
         camera: of each observation.
         point: of each observation.
         measured: "k m", px; finite everywhere.

@@ -1,6 +1,6 @@
 """Who sees what: tables of a bundle that are made once, on the host, from the numbers of cameras and points.
 
-Sums over ragged sets (the pictures of a point, the points of a picture, the pictures that share points) run over padded
+Sums over ragged sets (the images of a point, the points of an image, the images that share points) run over padded
 rows of fixed length, so that a compiled program serves every bundle of the same size.
 """
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-# Rows of the tables: short for points, which have few pictures each.
+# Rows of the tables: short for points, which have few images each.
 _ROW_POINT, _ROW_CAMERA, _ROW_PAIR = 4, 32, 16
 
 
@@ -66,7 +66,7 @@ class Structure(eqx.Module):
 
     @staticmethod
     def of(camera: Any, point: Any, *, num_cameras: int, num_points: int) -> "Structure":
-        """The tables of a bundle; their memory grows with the sum of the squared numbers of pictures of the points.
+        """The tables of a bundle; their memory grows with the sum of the squared numbers of images of the points.
 
         Args:
             camera: "m", number of the camera of each observation; concrete numbers, on the host.

@@ -1,4 +1,4 @@
-"""Cameras from pictures of a flat board: Zhang's start, a joint minimum, and the covariance of every parameter."""
+"""Cameras from images of a flat board: Zhang's start, a joint minimum, and the covariance of every parameter."""
 
 from jaxloc.refinement.calibration.camera import Calibrated, calibrate
 from jaxloc.refinement.calibration.model import Fisheye, Glass, Intrinsics, LensModel, NoLens, Parametrization

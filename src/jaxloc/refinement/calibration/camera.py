@@ -1,4 +1,4 @@
-"""One camera from pictures of a flat board."""
+"""One camera from images of a flat board."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ class Calibrated(eqx.Module):
 
     Attributes:
         camera: the camera.
-        T_camera_board: a pose for each picture.
+        T_camera_board: a pose for each image.
     """
 
     camera: Pinhole
@@ -45,7 +45,7 @@ def calibrate(
     loss: Any = Quadratic(),
     solver: Solver = LevenbergMarquardt(),
 ) -> Estimate:
-    """Focal lengths, principal point and lens of a camera from pictures of a flat board.
+    """Focal lengths, principal point and lens of a camera from images of a flat board.
 
     Minimizes ``sum rho(|project(T_i X_j) - z_ij|^2 / sigma^2)`` over the camera and the poses ``T_i`` of the boards,
     starting at Zhang's closed form. All unknowns are found together, so that the covariance of the camera knows that
@@ -57,23 +57,23 @@ def calibrate(
 
     Args:
         board: corners in the frame of the board, m, with z = 0.
-        corners: where they appear in each picture, px.
-        valid: corners that count; numbers of others have no influence, nor have numbers that are not finite. Pictures
+        corners: where they appear in each image, px.
+        valid: corners that count; numbers of others have no influence, nor have numbers that are not finite. Images
             with fewer than six corners do not count.
         intrinsics: which parameters are looked for.
-        shape: (rows, columns) of the pictures, for the start, and for a principal point that stays.
+        shape: (rows, columns) of the images, for the start, and for a principal point that stays.
         sigma: standard deviation of a coordinate of a corner, px; None takes it from the residuals.
         loss: robust kernel over the two coordinates of a corner, in sigmas.
         solver: how to minimize.
 
     Returns:
         Estimate of a `Calibrated`, whose tangent is (fx, fy, cx, cy, skew, coefficients of the lens, poses). What stays
-        has covariance zero. Pictures that do not count have the identity for a pose. ``ok`` is False when boards are
+        has covariance zero. Images that do not count have the identity for a pose. ``ok`` is False when boards are
         too few or all parallel, when a corner lies behind the camera, or when the solver did not converge. See
         `summarize` for names and standard deviations.
 
     Raises:
-        ValueError: if the number of corners of board and pictures differ.
+        ValueError: if the number of corners of board and images differ.
 
     References:
         Zhang, "A flexible new technique for camera calibration", T-PAMI 2000 [T-17], [T-16], [K-81].
@@ -110,7 +110,7 @@ def prepare(
 
 
 def check_corners(board: Array, *pictures: Array) -> None:
-    """Checks that pictures show the corners of the board.
+    """Checks that images show the corners of the board.
 
     Raises:
         ValueError: if the numbers of corners differ.
@@ -118,7 +118,7 @@ def check_corners(board: Array, *pictures: Array) -> None:
     for corners in pictures:
         if corners.shape[1] != board.shape[0]:
             raise ValueError(
-                f"The board has {board.shape[0]} corners, the pictures {corners.shape[1]}: give every picture all "
+                f"The board has {board.shape[0]} corners, the images {corners.shape[1]}: give every image all "
                 "corners in the order of the board, and mask those that it does not show by `valid`."
             )
 
@@ -182,7 +182,7 @@ def _median_spread(problem: BoardProblem, state: Unknowns) -> Float[Array, ""]:
 
 
 def _checked(found: Estimate) -> Estimate:
-    """Not ok where the data leave an unknown, in units of the picture, wholly open."""
+    """Not ok where the data leave an unknown, in units of the image, wholly open."""
     size = found.covariance.shape[0] - SE3.dof * found.value.boards.translation.shape[0]
     shared = jnp.diagonal(found.covariance)[:size]
     open_ = ~jnp.all(shared[:2] < 1.0)

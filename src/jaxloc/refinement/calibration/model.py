@@ -109,7 +109,7 @@ class Intrinsics(eqx.Module):
     Attributes:
         lens: `Glass`, `Fisheye` or `NoLens`.
         square_pixels: one focal length for rows and columns.
-        principal_point: whether it moves; otherwise it stays at the center of the pictures.
+        principal_point: whether it moves; otherwise it stays at the center of the images.
         skew: whether it moves; otherwise it is zero.
 
     Example:
@@ -155,7 +155,7 @@ class Parametrization(eqx.Module):
 
     @staticmethod
     def of(intrinsics: Intrinsics, center: Float[Array, "2"], scale: Float[Array, ""]) -> "Parametrization":
-        """Of pictures with this center (px), and this extent from it (px)."""
+        """Of images with this center (px), and this extent from it (px)."""
         offset = jnp.zeros(len(intrinsics.names()), center.dtype).at[2:4].set(center)
         return Parametrization(intrinsics, offset, scale)
 

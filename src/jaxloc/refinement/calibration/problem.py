@@ -1,7 +1,7 @@
-"""The reprojection errors of boards: unknowns that all pictures share, and a pose for each.
+"""The reprojection errors of boards: unknowns that all images share, and a pose for each.
 
-The Jacobian has the shape of an arrow: a picture knows the shared unknowns and its own pose. Derivatives are taken
-forward, picture by picture, in those few directions alone, and put in their places.
+The Jacobian has the shape of an arrow: an image knows the shared unknowns and its own pose. Derivatives are taken
+forward, image by image, in those few directions alone, and put in their places.
 """
 
 from abc import abstractmethod
@@ -28,8 +28,8 @@ class Unknowns(eqx.Module):
     """What is looked for.
 
     Attributes:
-        shared: by all pictures.
-        boards: a pose for each picture, ``T_camera_board`` of the (left) camera.
+        shared: by all images.
+        boards: a pose for each image, ``T_camera_board`` of the (left) camera.
     """
 
     shared: Any
@@ -37,7 +37,7 @@ class Unknowns(eqx.Module):
 
 
 class Rig(eqx.Module):
-    """What two cameras share over all pictures.
+    """What two cameras share over all images.
 
     Attributes:
         left: unknowns of the left camera.
@@ -53,12 +53,12 @@ class Rig(eqx.Module):
 class BoardProblem(Problem):
     """Boards with a pose each; subclasses say what one board looks like.
 
-    The residual is a pair: pixel errors, and for pictures that do not count the way from the pose at rest, which keeps
+    The residual is a pair: pixel errors, and for images that do not count the way from the pose at rest, which keeps
     the normal equations regular.
 
     Attributes:
         board: "3 m", m.
-        pixels: "n 2 k", px; k corners a picture, of all cameras.
+        pixels: "n 2 k", px; k corners an image, of all cameras.
         valid: those that count.
         sigma: of a coordinate of a corner, px.
     """
@@ -94,7 +94,7 @@ class BoardProblem(Problem):
         return _flat(errors), idle.T
 
     def linearize(self, state: Unknowns) -> Linearization:
-        """Residual and Jacobian, picture by picture."""
+        """Residual and Jacobian, image by image."""
         shared = tangent_dimension(state.shared)
 
         def local(pose: SE3, pixels: Array, valid: Array) -> tuple[Any, Any]:
@@ -110,7 +110,7 @@ class BoardProblem(Problem):
         return Linearization((_flat(errors), idle.T), jacobian)
 
     def hessian(self, state: Unknowns) -> Float[Array, "d d"]:
-        """Exact Hessian at a minimum, picture by picture."""
+        """Exact Hessian at a minimum, image by image."""
         shared, count = tangent_dimension(state.shared), self.pixels.shape[0]
 
         def local(pose: SE3, pixels: Array, valid: Array) -> Array:
@@ -167,7 +167,7 @@ class CameraProblem(BoardProblem):
 
 
 class StereoProblem(BoardProblem):
-    """Boards before two cameras; shared is a `Rig`. Corners of the right picture follow those of the left one."""
+    """Boards before two cameras; shared is a `Rig`. Corners of the right image follow those of the left one."""
 
     left: Parametrization
     right: Parametrization
@@ -228,7 +228,7 @@ def _flat(errors: Float[Array, "n 2 k"]) -> Float[Array, "2 i"]:
 
 
 def _arrow(slopes: Float[Array, "n d c k"], shared: int) -> Float[Array, "w c i"]:
-    """Derivatives of each picture in its place: shared directions first, then six for each pose."""
+    """Derivatives of each image in its place: shared directions first, then six for each pose."""
     count, _, components, size = slopes.shape
     common = jnp.moveaxis(slopes[:, :shared], 0, 2).reshape(shared, components, count * size)
     eye = jnp.eye(count, dtype=slopes.dtype)

@@ -1,4 +1,4 @@
-"""Two cameras that are fixed to each other, from pictures of a flat board that both may see."""
+"""Two cameras that are fixed to each other, from images of a flat board that both may see."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ from jaxloc.solvers import Estimate, LevenbergMarquardt, Quadratic, solve
 
 
 class Corners(eqx.Module):
-    """Corners of a board in the pictures of one camera.
+    """Corners of a board in the images of one camera.
 
     Attributes:
         pixels: px.
@@ -36,7 +36,7 @@ class CalibratedStereo(eqx.Module):
         left: the left camera.
         right: the right camera.
         T_left_right: pose of the right camera in the left one's frame.
-        T_left_board: a pose for each pair of pictures.
+        T_left_board: a pose for each pair of images.
     """
 
     left: Pinhole
@@ -56,7 +56,7 @@ def calibrate_stereo(
     sigma: Any = None,
     loss: Any = Quadratic(),
 ) -> Estimate:
-    """Two cameras, and the pose of one in the frame of the other, from pictures of a flat board.
+    """Two cameras, and the pose of one in the frame of the other, from images of a flat board.
 
     Minimizes the whitened reprojection errors of both cameras over both cameras, ``T_left_right`` and the poses
     ``T_left_board`` together: see `calibrate`, and the precision that it asks for. A pair in which only one camera sees
@@ -64,10 +64,10 @@ def calibrate_stereo(
 
     Args:
         board: corners in the frame of the board, m, with z = 0.
-        left: where they appear in each picture of the left camera.
-        right: where they appear in the picture of the right camera at the same instant.
+        left: where they appear in each image of the left camera.
+        right: where they appear in the image of the right camera at the same instant.
         intrinsics: which parameters are looked for, of either camera.
-        shape: (rows, columns) of the pictures, for the start, and for a principal point that stays.
+        shape: (rows, columns) of the images, for the start, and for a principal point that stays.
         sigma: standard deviation of a coordinate of a corner, px; None takes it from the residuals.
         loss: robust kernel over the two coordinates of a corner, in sigmas.
 
@@ -76,7 +76,7 @@ def calibrate_stereo(
         and the boards.
 
     Raises:
-        ValueError: if the numbers of corners of board and pictures differ.
+        ValueError: if the numbers of corners of board and images differ.
 
     References:
         Zhang 2000 [T-17]; the rig of thesis figure 2.4 [T-21].
@@ -91,8 +91,8 @@ def calibrate_stereo(
         ...     right = rig.inverse() @ pose
         ...     return camera.project(pose.apply(board)), camera.project(right.apply(board))
         >>> angles = jnp.array([[0.0, 0.3, 0.2], [0.2, -0.4, 0.1], [0.4, 0.1, -0.5], [0.1, -0.2, 0.4]])
-        >>> pictures = [Corners(side) for side in jax.vmap(view)(angles)]
-        >>> fit = calibrate_stereo(board, *pictures, intrinsics=Intrinsics(NoLens()), sigma=0.1)
+        >>> images = [Corners(side) for side in jax.vmap(view)(angles)]
+        >>> fit = calibrate_stereo(board, *images, intrinsics=Intrinsics(NoLens()), sigma=0.1)
         >>> bool(fit.ok), round(float(fit.value.T_left_right.translation[0]), 3)
         (True, 0.1)
     """

@@ -39,7 +39,7 @@ class Errors(eqx.Module):
     Attributes:
         errors: predicted minus measured corners, px; zero where masked.
         valid: corners that count.
-        board_rms: root mean square of the distance, of each picture, px; zero where it does not count.
+        board_rms: root mean square of the distance, of each image, px; zero where it does not count.
         rms: of all.
     """
 
@@ -94,7 +94,7 @@ def board_errors(
 
     Args:
         camera: the camera.
-        T_camera_board: a pose for each picture.
+        T_camera_board: a pose for each image.
         board: corners in the frame of the board, m.
         corners: where they appear, px.
         valid: corners that count.

@@ -17,7 +17,7 @@ _FEWEST_CORNERS = 6
 
 
 class Views(NamedTuple):
-    """Corners of a board in several pictures, made safe: finite everywhere.
+    """Corners of a board in several images, made safe: finite everywhere.
 
     Attributes:
         board: "3 m", frame of the board, m; points along the last axis.
@@ -58,7 +58,7 @@ def safe_views(board: Float[Array, "m 3"], corners: Float[Array, "n m 2"], valid
 
 
 def extent(views: Views, shape: tuple[int, int] | None) -> tuple[Float[Array, "2"], Float[Array, ""]]:
-    """Center of the pictures and half of their larger side, px: of the corners if no shape is given."""
+    """Center of the images and half of their larger side, px: of the corners if no shape is given."""
     dtype = views.pixels.dtype
     if shape is not None:
         rows, columns = shape
@@ -75,7 +75,7 @@ def closed_form(views: Views, center: Float[Array, "2"], scale: Float[Array, ""]
     """The best of three closed forms, by what is left over.
 
     Zhang's linear equations for the image of the absolute conic: with the principal point unknown; with it at the
-    center of the pictures; and with one focal length besides. The first is exact without noise and lens, the last
+    center of the images; and with one focal length besides. The first is exact without noise and lens, the last
     still stands where the others are ruined by them.
 
     References:

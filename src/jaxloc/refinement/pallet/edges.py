@@ -1,4 +1,4 @@
-"""Vertical edges of fork holes in a picture: level view, column profiles, darkening and lightening pairs, candidates.
+"""Vertical edges of fork holes in an image: level view, column profiles, darkening and lightening pairs, candidates.
 
 The edges of a hole are principally vertical, and come in pairs: from the left, wood darkens to the hole and lightens
 again. Columns are therefore judged by the mean of the horizontal derivative over a band of rows, taken only where the
@@ -16,21 +16,21 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.images.gradients import central_difference, smooth
 from jaxloc.images.interpolation import sample
-from jaxloc.images.normalization import as_grey
+from jaxloc.images.normalization import as_gray
 from jaxloc.refinement.pallet.model import PalletType
 from jaxloc.sensors import GroundCamera
 
 # Part of the height of a hole that is used: its rims are blurred.
 _INNER = 0.7
 _PARTS = 4  # of an edge, measured apart to see how they scatter
-_SMOOTHING = 1.0  # of the picture before it is differentiated, px
+_SMOOTHING = 1.0  # of the image before it is differentiated, px
 
 
 class LevelView(eqx.Module):
-    """A picture as a level camera without a lens would take it: columns tell bearings, rows elevations.
+    """An image as a level camera without a lens would take it: columns tell bearings, rows elevations.
 
     Attributes:
-        image: grey levels, smoothed by `smoothing`.
+        image: gray levels, smoothed by `smoothing`.
         slope: horizontal derivative, zero where the gradient is not principally horizontal.
         focal: px.
         middle: (column, row) of the horizontal ray straight ahead, px.
@@ -53,7 +53,7 @@ class Peaks(eqx.Module):
 
     Attributes:
         columns: to a fraction of a pixel.
-        strength: grey levels a pixel, zero in empty slots.
+        strength: gray levels a pixel, zero in empty slots.
     """
 
     columns: Float[Array, " k"]
@@ -65,7 +65,7 @@ class Candidate(eqx.Module):
 
     Attributes:
         columns: left to right, px.
-        strength: of the weakest, grey levels a pixel; zero where there is none.
+        strength: of the weakest, gray levels a pixel; zero where there is none.
     """
 
     columns: Float[Array, "4"]
@@ -77,7 +77,7 @@ class MeasuredEdges(eqx.Module):
 
     Attributes:
         columns: left to right, px.
-        strength: of the weakest, grey levels a pixel.
+        strength: of the weakest, gray levels a pixel.
         sigma: standard deviation of a column, px, as parts of the edges scatter.
     """
 
@@ -91,11 +91,11 @@ def level_view(image: Any, camera: GroundCamera) -> LevelView:
     """What a level camera without a lens would see from the same place.
 
     Args:
-        image: grey picture, bytes too.
+        image: gray image, bytes too.
         camera: that took it, with lens, height, pitch and roll.
 
     Returns:
-        A view of the same size, whose rows are turned so far that the middle of the picture stays where it was.
+        A view of the same size, whose rows are turned so far that the middle of the image stays where it was.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -104,25 +104,25 @@ def level_view(image: Any, camera: GroundCamera) -> LevelView:
         >>> view.image.shape, bool(jnp.all(view.slope == 0))
         ((48, 64), True)
     """
-    grey = as_grey(image, camera.camera.fx.dtype)
-    grey = jnp.where(jnp.isfinite(grey), grey, 0.0)
-    rows, columns = grey.shape
+    gray = as_gray(image, camera.camera.fx.dtype)
+    gray = jnp.where(jnp.isfinite(gray), gray, 0.0)
+    rows, columns = gray.shape
     focal = camera.camera.fx
     middle = jnp.stack([camera.camera.cx, camera.camera.cy - focal * jnp.tan(camera.pitch)])
-    u, v = (jnp.arange(size, dtype=grey.dtype) for size in (columns, rows))
-    left = jnp.broadcast_to(-(u - middle[0])[None, :] / focal, grey.shape)
-    up = jnp.broadcast_to(-(v - middle[1])[:, None] / focal, grey.shape)
+    u, v = (jnp.arange(size, dtype=gray.dtype) for size in (columns, rows))
+    left = jnp.broadcast_to(-(u - middle[0])[None, :] / focal, gray.shape)
+    up = jnp.broadcast_to(-(v - middle[1])[:, None] / focal, gray.shape)
     axes = camera.axes()
     x, y, z = (axes[0, i] + axes[1, i] * left + axes[2, i] * up for i in range(3))
     places = jnp.stack([c.reshape(-1) for c in camera.camera.project_components(x, y, z)], axis=1)
-    level = sample(grey, places)
-    seen = level.inside.reshape(grey.shape)
-    smoothed = smooth(level.values.reshape(grey.shape), _SMOOTHING)
+    level = sample(gray, places)
+    seen = level.inside.reshape(gray.shape)
+    smoothed = smooth(level.values.reshape(gray.shape), _SMOOTHING)
     return LevelView(smoothed, _principal(smoothed, seen), focal, middle, camera.height)
 
 
 def _principal(image: Float[Array, "h w"], seen: Bool[Array, "h w"]) -> Float[Array, "h w"]:
-    """Horizontal derivative where it is the principal one, zero beside the picture."""
+    """Horizontal derivative where it is the principal one, zero beside the image."""
     slope = central_difference(image)
     whole = smooth(jnp.where(seen, 1.0, 0.0).astype(image.dtype), 1.0) > 0.999
     return jnp.where(whole & (jnp.abs(slope.right) >= jnp.abs(slope.down)), slope.right, 0.0)
@@ -134,7 +134,7 @@ def summed(slope: Float[Array, "h w"]) -> Float[Array, "h1 w"]:
 
 
 def band_profile(sums: Float[Array, "h1 w"], top: Float[Array, ""], bottom: Float[Array, ""]) -> Float[Array, " w"]:
-    """Mean of each column between two rows, parts of rows included; zero for bands that are not in the picture."""
+    """Mean of each column between two rows, parts of rows included; zero for bands that are not in the image."""
     high, low = (jnp.clip(row + 0.5, 0.0, sums.shape[0] - 1.0) for row in (top, bottom))
     inside = (low - high) > 0.5 * (bottom - top)
 
@@ -203,7 +203,7 @@ def best_candidate(profile: Float[Array, " w"], kind: PalletType, span: Float[Ar
     range changes; both holes of nearly one width; and a span that a pallet turned by up to 45 degrees may have.
 
     Args:
-        profile: mean horizontal derivative of the columns, grey levels a pixel.
+        profile: mean horizontal derivative of the columns, gray levels a pixel.
         kind: of pallet.
         span: columns between the outer edges of a pallet that faces the camera, px.
         count: edges of each polarity that are tried; static.
@@ -237,7 +237,7 @@ def edges_along(
     """Four edges measured anew, each in the rows where its own distance puts the hole.
 
     Args:
-        view: the picture.
+        view: the image.
         sums: of its `slope`, by `summed`.
         kind: of pallet.
         columns: where the edges are expected, px.

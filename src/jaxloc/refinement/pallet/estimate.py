@@ -1,7 +1,7 @@
-"""Find the pallet: from a picture to the pose of the pallet in it, or the word that there is none [K-14].
+"""Find the pallet: from an image to the pose of the pallet in it, or the word that there is none [K-14].
 
 Edges of fork holes are proposed at a ladder of ranges, four of them picked by polarity and by the ratio of hole width
-to separation, a pose fitted to them, and the front of each kind compared with the picture there. The best one has its
+to separation, a pose fitted to them, and the front of each kind compared with the image there. The best one has its
 edges measured anew, each in its own rows, before the final pose.
 """
 
@@ -39,7 +39,7 @@ class PalletSearch(eqx.Module):
         edges: of each polarity that are tried at a range; static.
         sigma: what the columns of edges are off beside their scatter, px: worn wood, a camera not quite level.
         tolerance: how badly four edges may fit one pose, px.
-        least_strength: of an edge, grey levels a pixel.
+        least_strength: of an edge, gray levels a pixel.
         least_correlation: with the front of the kind.
     """
 
@@ -59,7 +59,7 @@ class FoundPallet(eqx.Module):
     Attributes:
         estimate: of ``T_ground_pallet``; ``ok`` is False where no pallet of the kinds asked for was found.
         kind: index of the kind that fits best.
-        correlation: of the picture with the front of each kind, each at the pose that fits it best.
+        correlation: of the image with the front of each kind, each at the pose that fits it best.
         columns: of the four edges in the level view, px.
     """
 
@@ -85,10 +85,10 @@ def find_pallet(
     *,
     search: PalletSearch = PalletSearch(),
 ) -> Estimate:
-    """The pose of a pallet in a picture.
+    """The pose of a pallet in an image.
 
     Args:
-        image: grey levels, bytes too.
+        image: gray levels, bytes too.
         camera: that took it: lens, height, pitch and roll.
         types: kinds of pallets that may be there.
         search: where and how to look.
@@ -96,7 +96,7 @@ def find_pallet(
     Returns:
         Estimate of the pose ``T_ground_pallet`` of the middle of its face on the ground: x forward, y left of the
         camera's foot, heading of the way forks go in. ``ok`` is False when there is no pallet of these kinds, or when
-        it is not certain. Derivatives by the picture are those of the four edges that were found.
+        it is not certain. Derivatives by the image are those of the four edges that were found.
 
     Raises:
         ValueError: no types.
@@ -125,7 +125,7 @@ def detect_pallet(
     """`find_pallet` with the kind, the correlations and the edges.
 
     Args:
-        image: grey levels, bytes too.
+        image: gray levels, bytes too.
         camera: that took it.
         types: kinds of pallets that may be there.
         search: where and how to look.
@@ -153,7 +153,7 @@ def detect_pallet(
 
 
 def _propose(view: LevelView, sums: Array, kind: PalletType, search: PalletSearch) -> _Proposal:
-    """The pose of one kind whose front the picture resembles most, of the best four edges at each range."""
+    """The pose of one kind whose front the image resembles most, of the best four edges at each range."""
     inverse = jnp.linspace(1.0 / search.nearest, 1.0 / search.farthest, search.ranges, dtype=sums.dtype)
 
     def at_range(x: Float[Array, ""]) -> _Proposal:

@@ -1,4 +1,4 @@
-"""Which kind of pallet a face is: the correlation with a picture of each kind's front, drawn by its measures [K-75]."""
+"""Which kind of pallet a face is: the correlation with an image of each kind's front, drawn by its measures [K-75]."""
 
 import equinox as eqx
 import jax
@@ -34,15 +34,15 @@ def face_template(kind: PalletType) -> Float[Array, "24 128"]:
 
 @eqx.filter_jit
 def view_face(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, "24 128"]:
-    """What the picture shows where the face of a pallet would be, sampled along the face.
+    """What the image shows where the face of a pallet would be, sampled along the face.
 
     Args:
-        view: the picture.
+        view: the image.
         kind: whose measures to take.
         pose: ``T_ground_pallet``.
 
     Returns:
-        Grey levels, nan where the face is not in the picture.
+        Gray levels, nan where the face is not in the image.
     """
     along, level = _grid(kind)
     rotation = pose.rotation.matrix()
@@ -58,15 +58,15 @@ def view_face(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, "24 
 
 @eqx.filter_jit
 def type_correlation(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, ""]:
-    """Normalized correlation of the picture at a pose with the front of a kind: one for what is drawn by its measures.
+    """Normalized correlation of the image at a pose with the front of a kind: one for what is drawn by its measures.
 
     Args:
-        view: the picture.
+        view: the image.
         kind: of pallet.
         pose: ``T_ground_pallet``.
 
     Returns:
-        In [-1, 1]; zero where less than four fifths of the face is in the picture.
+        In [-1, 1]; zero where less than four fifths of the face is in the image.
 
     References:
         KELLY 9.2.4.2.2, templates correlated to identify the type [K-75].
@@ -85,7 +85,7 @@ def correlate_types(view: LevelView, kinds: PalletType, pose: SE2) -> Float[Arra
     """`type_correlation` with each kind of a bank at one pose.
 
     Args:
-        view: the picture.
+        view: the image.
         kinds: a stack, as `stack_types` makes it.
         pose: ``T_ground_pallet``.
 

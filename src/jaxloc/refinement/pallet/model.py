@@ -19,7 +19,7 @@ from jaxloc.poses import SE2
 from jaxloc.poses.lie_group import as_floats, matmul
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Problem, Quadratic, solve
 
-_NEAREST = 0.05  # edges nearer than this to the plane of the camera have no picture, m
+_NEAREST = 0.05  # edges nearer than this to the plane of the camera have no image, m
 _UNSEEN = 1e3
 
 
@@ -60,7 +60,7 @@ class PalletType(eqx.Module):
         return jnp.stack([outer, inner, -inner, -outer])
 
     def ratio(self) -> Float[Array, ""]:
-        """Hole width over separation: in the picture it hardly depends on range [K-74]."""
+        """Hole width over separation: in the image it hardly depends on range [K-74]."""
         return self.hole_width / self.separation
 
 
@@ -83,7 +83,7 @@ def hole_ratio(bearings: Float[Array, "4"]) -> Float[Array, ""]:
     """Mean width of the holes over their separation, seen: constant over range for a pallet that faces the camera.
 
     Args:
-        bearings: the four edges in the picture, left to right, any unit and sign.
+        bearings: the four edges in the image, left to right, any unit and sign.
 
     Returns:
         The ratio, zero where the holes are not apart.

@@ -16,7 +16,7 @@ _ELSEWHERE = -20.0  # log density off the mosaic: no robot is there, but no weig
 
 
 class CeilingMosaic(eqx.Module):
-    """A picture of a ceiling, as seen from the floor straight below each point.
+    """An image of a ceiling, as seen from the floor straight below each point.
 
     Args:
         brightness: "rows columns" in [0, 1]; columns grow with x, rows with y.

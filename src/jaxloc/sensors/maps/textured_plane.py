@@ -1,4 +1,4 @@
-"""A picture painted on a plane of the world: floors, walls and signs as maps of what a camera will see."""
+"""An image painted on a plane of the world: floors, walls and signs as maps of what a camera will see."""
 
 from typing import Any
 
@@ -14,10 +14,10 @@ from jaxloc.sensors.camera import Pinhole
 
 
 class Predicted(eqx.Module):
-    """A predicted picture.
+    """A predicted image.
 
     Attributes:
-        image: grey levels; zero where the plane is not seen.
+        image: gray levels; zero where the plane is not seen.
         seen: where it is.
     """
 
@@ -28,11 +28,11 @@ class Predicted(eqx.Module):
 class TexturedPlane(eqx.Module):
     """A map image ``Z`` on a plane: the appearance that a pose predicts, ``z(x) = Z(T^-1 x)`` [K-11, K-45].
 
-    The plane's axes lie in it: x along the rows of the picture (to the right), y along its columns (down), so that z
+    The plane's axes lie in it: x along the rows of the image (to the right), y along its columns (down), so that z
     points away from who looks at it; pixel (0, 0) has its center at the plane's origin.
 
     Args:
-        texture: "rows columns", grey levels.
+        texture: "rows columns", gray levels.
         resolution: edge of a pixel, m.
         T_world_plane: pose of the plane.
 
@@ -64,7 +64,7 @@ class TexturedPlane(eqx.Module):
             ValueError: the camera has a lens, which bends straight lines.
         """
         if camera.lens is not None:
-            raise ValueError("TexturedPlane.homography: a lens bends lines; undistort the picture first.")
+            raise ValueError("TexturedPlane.homography: a lens bends lines; undistort the image first.")
         matrix = (T_world_camera.inverse() @ self.T_world_plane).matrix()
         columns = jnp.stack([self.resolution * matrix[:3, 0], self.resolution * matrix[:3, 1], matrix[:3, 3]], axis=1)
         return Homography.from_matrix(matmul(camera.matrix(), columns))
@@ -83,11 +83,11 @@ class TexturedPlane(eqx.Module):
         Args:
             camera: intrinsics and lens.
             T_world_camera: its pose.
-            shape: rows and columns of the picture; static.
+            shape: rows and columns of the image; static.
             method: interpolation of the map.
 
         Returns:
-            The picture; differentiable in map, pose and camera.
+            The image; differentiable in map, pose and camera.
         """
         u, v = jnp.meshgrid(*(jnp.arange(size, dtype=self.texture.dtype) for size in shape[::-1]))
         x, y = camera.normalize_components(u.reshape(-1), v.reshape(-1))

@@ -1,4 +1,4 @@
-"""Many pictures of a floor made one: exposures balanced, bright middles of pictures counted most."""
+"""Many images of a floor made one: exposures balanced, bright middles of images counted most."""
 
 from typing import Any
 
@@ -18,11 +18,11 @@ from jaxloc.solvers.cholesky import factor
 
 
 class Exposure(eqx.Module):
-    """How a picture's grey levels follow from the floor's: ``picture = gain floor + bias``; one, or a stack.
+    """How an image's gray levels follow from the floor's: ``image = gain floor + bias``; one, or a stack.
 
     Attributes:
         gain: contrast.
-        bias: grey levels.
+        bias: gray levels.
     """
 
     gain: Float[Array, "*n"]
@@ -30,7 +30,7 @@ class Exposure(eqx.Module):
 
     @staticmethod
     def none(count: int, dtype: Any = float) -> "Exposure":
-        """Of pictures that need no change."""
+        """Of images that need no change."""
         return Exposure(jnp.ones(count, dtype), jnp.zeros(count, dtype))
 
 
@@ -38,20 +38,20 @@ class Exposure(eqx.Module):
 def balance(
     first: Int[Array, " m"], second: Int[Array, " m"], overlaps: Overlap, valid: Bool[Array, " m"], *, count: int
 ) -> Exposure:
-    """Exposures of all pictures from what pairs of them show of the same floor.
+    """Exposures of all images from what pairs of them show of the same floor.
 
     Gains by least squares of ``log(s_i / s_j) = log g_i - log g_j`` for the standard deviations s in the overlap, then
-    biases likewise from the means; their mean over all pictures is fixed. Pairs count by their overlap.
+    biases likewise from the means; their mean over all images is fixed. Pairs count by their overlap.
 
     Args:
-        first: number of one picture of each pair.
+        first: number of one image of each pair.
         second: number of the other.
         overlaps: of the pairs, stacked.
         valid: which pairs count.
-        count: number of pictures; static.
+        count: number of images; static.
 
     Returns:
-        The exposures, stacked; those of a picture without pairs leave it as it is.
+        The exposures, stacked; those of an image without pairs leave it as it is.
 
     References:
         [K-84]; Brown and Lowe, "Automatic panoramic image stitching", 2007, section 6 (gain compensation).
@@ -118,7 +118,7 @@ def blend(
 ) -> Patch:
     """Lays patches side by side and over each other: ``sum_k w_k (I_k - b_k) / g_k / sum_k w_k``.
 
-    The weight is the vignetting's, so that the bright middles of pictures make the mosaic and no seam shows.
+    The weight is the vignetting's, so that the bright middles of images make the mosaic and no seam shows.
 
     Args:
         patches: of equal rasters, values and weights stacked along a leading axis.

@@ -1,4 +1,4 @@
-"""Pixels of a plane in meters: what lies between pictures of a floor and poses on it."""
+"""Pixels of a plane in meters: what lies between images of a floor and poses on it."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""A picture of a floor laid upon another: the motion between them, straight from grey levels."""
+"""An image of a floor laid upon another: the motion between them, straight from gray levels."""
 
 import equinox as eqx
 import jax
@@ -24,7 +24,7 @@ class Overlap(eqx.Module):
 
     Attributes:
         share: part of the second patch that lies on the first.
-        means: grey level of the first and of the second there.
+        means: gray level of the first and of the second there.
         deviations: their standard deviations there.
     """
 
@@ -34,7 +34,7 @@ class Overlap(eqx.Module):
 
 
 class Registration(eqx.Module):
-    """A motion between two pictures.
+    """A motion between two images.
 
     Attributes:
         estimate: of ``T_first_second``, m and rad.
@@ -59,8 +59,8 @@ def register(first: Patch, second: Patch, predicted: SE2, *, method: LucasKanade
         method: choices of the alignment.
 
     Returns:
-        The motion with its covariance in its tangent (m, m, rad): noise of both pictures. ``ok`` is False without
-        overlap or texture, or where the pictures do not agree.
+        The motion with its covariance in its tangent (m, m, rad): noise of both images. ``ok`` is False without
+        overlap or texture, or where the images do not agree.
 
     References:
         Sequential mosaicking with known range and an odometry prior [K-83]; the compound-left Jacobian of K-85 is what

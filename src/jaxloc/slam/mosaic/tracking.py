@@ -1,4 +1,4 @@
-"""A camera followed in a mosaic of the floor, at the rate of its pictures."""
+"""A camera followed in a mosaic of the floor, at the rate of its images."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from jaxloc.slam.mosaic.register import in_meters
 from jaxloc.slam.mosaic.view import FloorView, Patch, Rectifier
 from jaxloc.solvers import Estimate
 
-# A mosaic is the mean of several pictures: most of the noise is that of the one that is laid upon it.
+# A mosaic is the mean of several images: most of the noise is that of the one that is laid upon it.
 TRACKING = LucasKanade(
     scales=Pyramid(levels=4, least=40), template_noise=1.5, min_coverage=0.4, max_steps=15, tolerance=5e-3
 )
@@ -33,14 +33,14 @@ def track(
     method: LucasKanade = TRACKING,
     margin: int = 32,
 ) -> Estimate:
-    """Pose of a camera over a floor from one picture, a mosaic and a prediction.
+    """Pose of a camera over a floor from one image, a mosaic and a prediction.
 
-    The picture is rectified on the raster of the view and laid upon a window of the mosaic about the predicted pose
+    The image is rectified on the raster of the view and laid upon a window of the mosaic about the predicted pose
     (of a fixed size: one program serves all poses) by `lucas_kanade.align` on rotations and shifts.
 
     Args:
         mosaic: the map.
-        image: grey levels, bytes or numbers.
+        image: gray levels, bytes or numbers.
         predicted: guess of the pose ``T_floor_camera`` of the camera's road frame, right to `margin` pixels.
         view: camera and raster, of the mosaic's resolution; its `rectifier`, made once, is quicker. A smaller raster
             (`FloorView.part`) is quicker too.
@@ -48,9 +48,9 @@ def track(
         margin: how far beyond the patch the window reaches, px; static.
 
     Returns:
-        Estimate of ``T_floor_camera`` with covariance in its tangent (m, m, rad), from the noise of the pictures.
-        ``ok`` is False off the mosaic, on a blank or featureless picture, or where picture and mosaic do not agree; the
-        value is finite in any case. It has the derivatives of the solution by mosaic, picture and view.
+        Estimate of ``T_floor_camera`` with covariance in its tangent (m, m, rad), from the noise of the images.
+        ``ok`` is False off the mosaic, on a blank or featureless image, or where image and mosaic do not agree; the
+        value is finite in any case. It has the derivatives of the solution by mosaic, image and view.
 
     References:
         Floor-mosaic tracking [K-80]: "submillimeter precision and 60 mph speeds are possible".

@@ -10,18 +10,18 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc.images.interpolation import AbstractInterpolation, Bicubic, sample_components
-from jaxloc.images.normalization import as_grey
+from jaxloc.images.normalization import as_gray
 from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors.ground_camera import GroundCamera
 from jaxloc.slam.mosaic.raster import Raster
 from jaxloc.solvers.cholesky import factor
 
 _DARKEST = 0.05  # less light than this tells nothing
-_TAPER = 12.0  # pixels along the border of a picture whose weight rises from zero
+_TAPER = 12.0  # pixels along the border of an image whose weight rises from zero
 
 
 class Falloff(eqx.Module):
-    """How a camera's picture darkens from its middle to its corners."""
+    """How a camera's image darkens from its middle to its corners."""
 
     @abstractmethod
     def shade(self, u: Float[Array, "*n"], v: Float[Array, "*n"], cosine: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -38,7 +38,7 @@ class CosineFourth(Falloff):
 
 
 class RadialFalloff(Falloff):
-    """A measured falloff: ``exp(c1 r^2 + c2 r^4 + c3 r^6)``, r counted from the middle of the picture.
+    """A measured falloff: ``exp(c1 r^2 + c2 r^4 + c3 r^6)``, r counted from the middle of the image.
 
     Attributes:
         coefficients: c1, c2, c3.
@@ -61,16 +61,16 @@ class RadialFalloff(Falloff):
 
 @eqx.filter_jit
 def fit_falloff(frames: Num[Array, "n h w"] | Any, *, black: Any = 0.0) -> RadialFalloff:
-    """Measures the falloff from pictures of many places: what they share is the camera's.
+    """Measures the falloff from images of many places: what they share is the camera's.
 
-    Least squares of the logarithm of the mean picture, each picture brought to mean one before.
+    Least squares of the logarithm of the mean image, each image brought to mean one before.
 
     Args:
-        frames: pictures of an evenly lit floor; ten or more.
-        black: grey level of darkness.
+        frames: images of an evenly lit floor; ten or more.
+        black: gray level of darkness.
 
     Returns:
-        The falloff; none where the pictures are black.
+        The falloff; none where the images are black.
 
     References:
         [K-84].
@@ -105,11 +105,11 @@ def fit_falloff(frames: Num[Array, "n h w"] | Any, *, black: Any = 0.0) -> Radia
 
 
 class Patch(eqx.Module):
-    """A piece of floor on a raster: what one picture shows in its camera's road frame, or a mosaic in the floor's.
+    """A piece of floor on a raster: what one image shows in its camera's road frame, or a mosaic in the floor's.
 
     Attributes:
-        values: evenly lit grey levels; zero where nothing is seen.
-        weight: how much each is worth, in pixels from the middle of a picture; zero where nothing is seen.
+        values: evenly lit gray levels; zero where nothing is seen.
+        weight: how much each is worth, in pixels from the middle of an image; zero where nothing is seen.
         raster: where the pixels lie. In a stack of patches, one for all.
     """
 
@@ -128,15 +128,15 @@ class Patch(eqx.Module):
 
 
 class Rectifier(eqx.Module):
-    """Where each pixel of a raster of floor is found in a picture, and how well it is lit: the same for all pictures.
+    """Where each pixel of a raster of floor is found in an image, and how well it is lit: the same for all images.
 
     Attributes:
-        u: columns in the picture.
-        v: rows in the picture.
+        u: columns in the image.
+        v: rows in the image.
         shade: part of the light that arrives; zero where the camera does not look.
-        black: grey level of darkness.
+        black: gray level of darkness.
         raster: of the floor.
-        interpolation: of pictures.
+        interpolation: of images.
     """
 
     u: Float[Array, " n"]
@@ -148,19 +148,19 @@ class Rectifier(eqx.Module):
 
     @eqx.filter_jit
     def rectify(self, image: Num[Array, "h w"] | Any) -> Patch:
-        """The floor in a picture: ``(image(u, v) - black) / shade`` [K-81, K-84].
+        """The floor in an image: ``(image(u, v) - black) / shade`` [K-81, K-84].
 
-        The weight is the light squared, for the noise left is that of the picture over the light, and fades out along
-        the borders of picture and raster.
+        The weight is the light squared, for the noise left is that of the image over the light, and fades out along
+        the borders of image and raster.
 
         Args:
-            image: grey levels, bytes or numbers; pixels that are not finite are left out.
+            image: gray levels, bytes or numbers; pixels that are not finite are left out.
 
         Returns:
             The patch.
         """
         dtype, gaps = self.u.dtype, jnp.issubdtype(jnp.asarray(image).dtype, jnp.floating)
-        image = as_grey(image, dtype)
+        image = as_gray(image, dtype)
         finite = jnp.isfinite(image)
         values, inside = sample_components(jnp.where(finite, image, 0.0), self.u, self.v, method=self.interpolation)
         border_u = jnp.minimum(self.u, image.shape[1] - 1 - self.u)
@@ -176,7 +176,7 @@ class Rectifier(eqx.Module):
 
     @eqx.filter_jit
     def rectify_all(self, images: Num[Array, "n h w"] | Any) -> Patch:
-        """The floor in many pictures: values and weights stacked, one raster for all."""
+        """The floor in many images: values and weights stacked, one raster for all."""
 
         def one(image: Array) -> tuple[Array, Array]:
             patch = self.rectify(image)
@@ -198,9 +198,9 @@ class FloorView(eqx.Module):
     Attributes:
         ground: camera, lens, height and attitude.
         falloff: of its light.
-        black: grey level of darkness.
-        raster: in the camera's road frame (x to the top of the picture, y to its left), m.
-        interpolation: of pictures.
+        black: gray level of darkness.
+        raster: in the camera's road frame (x to the top of the image, y to its left), m.
+        interpolation: of images.
     """
 
     ground: GroundCamera
@@ -219,15 +219,15 @@ class FloorView(eqx.Module):
         falloff: Falloff = CosineFourth(),
         black: Any = 0.0,
     ) -> "FloorView":
-        """The view of a camera's whole picture, or of a part in its middle.
+        """The view of a camera's whole image, or of a part in its middle.
 
         Args:
             ground: camera that looks down.
-            image_shape: rows and columns of its pictures.
-            shape: rows (along y) and columns (along x) of the raster; by default as many as the picture has.
-            resolution: edge of a pixel, m; by default what a pixel in the middle of the picture covers.
+            image_shape: rows and columns of its images.
+            shape: rows (along y) and columns (along x) of the raster; by default as many as the image has.
+            resolution: edge of a pixel, m; by default what a pixel in the middle of the image covers.
             falloff: of its light.
-            black: grey level of darkness.
+            black: gray level of darkness.
 
         Example:
             >>> import jax.numpy as jnp, jaxloc as jl
@@ -260,7 +260,7 @@ class FloorView(eqx.Module):
 
     @eqx.filter_jit
     def rectifier(self) -> Rectifier:
-        """All that does not change from picture to picture, computed once."""
+        """All that does not change from image to image, computed once."""
         x, y = (axis.reshape(-1) for axis in self.raster.centers())
         u, v = self.ground.project_components(x, y)
         right, down, forward = self.ground.camera_components(x, y)
@@ -269,8 +269,8 @@ class FloorView(eqx.Module):
         return Rectifier(u, v, shade, self.black, self.raster, self.interpolation)
 
     def rectify(self, image: Num[Array, "h w"] | Any) -> Patch:
-        """The floor in one picture; differentiable in image, camera, height and falloff.
+        """The floor in one image; differentiable in image, camera, height and falloff.
 
-        Of many pictures, keep the `rectifier`: it does the greater part of the work once.
+        Of many images, keep the `rectifier`: it does the greater part of the work once.
         """
         return self.rectifier().rectify(image)

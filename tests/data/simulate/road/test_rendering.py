@@ -36,7 +36,7 @@ def light_column(row, low, high):
 )
 def test_marks_lie_where_the_projection_says(lane, ground):
     image = render(PLAIN, lane, ground, shape=SHAPE, noise=0.0)
-    # The border as a curve in the picture, and its column in some rows.
+    # The border as a curve in the image, and its column in some rows.
     x = jnp.linspace(2.0, 40.0, 4000)
     for side in (1.8, -1.8):
         border = lane.center(x) + side
@@ -79,17 +79,17 @@ def test_dashes_cover_their_share_at_any_distance():
     for along in (0.01, 5.0, 40.0):
         cover = mark.cover(s, np.zeros_like(s), np.full_like(s, along), np.full_like(s, 0.05))
         assert cover.mean() == pytest.approx(0.25, abs=2e-3)
-    assert np.ptp(cover) < 0.15, "far away dashes become a grey line"
+    assert np.ptp(cover) < 0.15, "far away dashes become a gray line"
 
 
 def test_shadows_darken_stretches_of_the_road():
     s, ones = np.linspace(0.0, 500.0, 20_001).astype(np.float32), np.ones(20_001, np.float32)
     road = Road(marks=(), streaks=(), grain=0.0, shadows=Shadows(spacing=25.0, length=4.0, gain=0.5))
-    grey = road.shade(s, 0.0 * s, 0.02 * ones, 0.02 * ones)
-    assert grey.max() == pytest.approx(105.0, abs=0.1) and grey.min() < 55.0
-    assert 0.08 < np.mean(grey < 80.0) < 0.25
+    gray = road.shade(s, 0.0 * s, 0.02 * ones, 0.02 * ones)
+    assert gray.max() == pytest.approx(105.0, abs=0.1) and gray.min() < 55.0
+    assert 0.08 < np.mean(gray < 80.0) < 0.25
     blurred = road.shade(s, 0.0 * s, 200.0 * ones, 0.02 * ones)
-    assert np.ptp(blurred) < 0.25 * np.ptp(grey)
+    assert np.ptp(blurred) < 0.25 * np.ptp(gray)
 
 
 def test_pictures_are_deterministic_and_marks_can_be_left_out():

@@ -90,7 +90,7 @@ def _form(inputs: Inputs) -> str:
     if form == "mot":
         for name, path in (("--poses", inputs.poses), ("--calib", inputs.calibration)):
             if path is not None:
-                raise DataError(name, "is of no use to boxes in pictures (format mot)")
+                raise DataError(name, "is of no use to boxes in images (format mot)")
     return form
 
 
@@ -180,7 +180,7 @@ def _row(record: report.Record, frame: int, slot: int, projection: np.ndarray | 
 
 
 def _pixel(record: report.Record, frame: int, slot: int, projection: np.ndarray | None) -> list[float]:
-    """Where a track is in the picture: its place, where the camera is known, else the center of its box."""
+    """Where a track is in the image: its place, where the camera is known, else the center of its box."""
     if projection is None:
         boxed = record.boxed[frame, slot]
         return report.centers(record.boxes[frame : frame + 1])[0, slot].tolist() if boxed else []

@@ -47,7 +47,7 @@ class Record:
 
     @property
     def solid(self) -> bool:
-        """Whether places are in the world, and not in pictures."""
+        """Whether places are in the world, and not in images."""
         return self.found.positions is not None
 
     def tracks(self) -> LabelledTracks:
@@ -136,7 +136,7 @@ class Record:
         centered = tracked.places[..., :2]
         axes = {"axes": (0, 1), "unit": "px", "downwards": True}
         figure = plots.draw_tracks(centered, tracked.ids, tracked.valid, **axes, **shades)
-        return report.Section("Tracks", "Centers of the boxes in the picture.", figure)
+        return report.Section("Tracks", "Centers of the boxes in the image.", figure)
 
     def _numbers(self) -> report.Section:
         true = None if self.truth is None else self.truth.detections.valid.sum(axis=1)

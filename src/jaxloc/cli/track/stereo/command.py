@@ -1,4 +1,4 @@
-"""``jaxloc track SEQUENCE``: run the pipeline, write rows and pictures as they come, then metrics and report."""
+"""``jaxloc track SEQUENCE``: run the pipeline, write rows and images as they come, then metrics and report."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -86,7 +86,7 @@ def _stream(
     interruption: session.Interruption,
     known: bool,
 ) -> None:
-    """Writes the rows of each frame, and some pictures, until the end or an interrupt."""
+    """Writes the rows of each frame, and some images, until the end or an interrupt."""
     from jaxloc.pipelines import moving_objects
 
     poses = None
@@ -102,7 +102,7 @@ def _stream(
             last[:] = [frame]
             yield frame
 
-    (out / "pictures").mkdir(exist_ok=True)
+    (out / "images").mkdir(exist_ok=True)
     with ExitStack() as stack:
         rows = stack.enter_context(RowWriter(out / "tracks.csv", HEADER))
         trajectory = stack.enter_context(RowWriter(out / "trajectory.txt"))
@@ -115,7 +115,7 @@ def _stream(
             if step.index in pictured:
                 picture = plots.draw_objects(last[0].left, step.points, step.boxes, *_places(step.tracks))
                 record.pictures.append((step.index, picture))
-                write_file(out / "pictures" / f"{step.index:06d}.png", plots.encode(picture))
+                write_file(out / "images" / f"{step.index:06d}.png", plots.encode(picture))
             progress(step.index + 1)
             if interruption.requested:
                 break

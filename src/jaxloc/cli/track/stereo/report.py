@@ -16,7 +16,7 @@ class Record:
     Attributes:
         title: of the report.
         steps: of the pipeline.
-        pictures: numbers and figures of annotated frames.
+        images: numbers and figures of annotated frames.
         interrupted: whether the run ended early.
     """
 

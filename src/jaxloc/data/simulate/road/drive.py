@@ -1,4 +1,4 @@
-"""A drive along a synthetic road: pictures, and where the vehicle was in its lane at each of them."""
+"""A drive along a synthetic road: images, and where the vehicle was in its lane at each of them."""
 
 from collections.abc import Iterator
 
@@ -18,7 +18,7 @@ class Course(eqx.Module):
 
     Args:
         speed: m/s.
-        interval: between two pictures, s.
+        interval: between two images, s.
         curvature: amplitude, 1/m,
         bend: and wavelength along the road, m.
         sway: amplitude of the offset, m,
@@ -40,18 +40,18 @@ class Course(eqx.Module):
 
 
 class RoadDrive(eqx.Module):
-    """A drive with its truth; pictures are made when they are asked for.
+    """A drive with its truth; images are made when they are asked for.
 
     Attributes:
         road: what it looks like.
         ground: the camera with its mean pitch.
         times: s.
         travelled: way along the road, m.
-        lanes: offset (m), heading (rad), curvature (1/m) and its rate (1/m^2) at each picture.
-        pitches: of the camera at each picture, rad.
+        lanes: offset (m), heading (rad), curvature (1/m) and its rate (1/m^2) at each image.
+        pitches: of the camera at each image, rad.
         speeds: m/s.
         yaw_rates: counter-clockwise, rad/s.
-        shape: rows and columns of a picture.
+        shape: rows and columns of an image.
         geometry: of the road.
     """
 
@@ -70,16 +70,16 @@ class RoadDrive(eqx.Module):
         return len(self.times)
 
     def lane(self, index: int) -> Lane:
-        """The true lane at a picture."""
+        """The true lane at an image."""
         return Lane(*(float(value) for value in self.lanes[index]))
 
     def camera(self, index: int) -> GroundCamera:
-        """The camera with its true pitch at a picture."""
+        """The camera with its true pitch at an image."""
         pitch = jnp.asarray(self.pitches[index], self.ground.height.dtype)
         return eqx.tree_at(lambda ground: ground.pitch, self.ground, pitch)
 
     def frame(self, index: int) -> Float32[np.ndarray, "h w"]:
-        """A picture."""
+        """An image."""
         return render(
             self.road,
             self.lane(index),
@@ -91,7 +91,7 @@ class RoadDrive(eqx.Module):
         )
 
     def frames(self) -> Iterator[Float32[np.ndarray, "h w"]]:
-        """All pictures, one after the other."""
+        """All images, one after the other."""
         return (self.frame(index) for index in range(len(self)))
 
 
@@ -110,10 +110,10 @@ def drive(
     Args:
         road: what it looks like.
         ground: the camera with its mean pitch.
-        num_frames: pictures.
+        num_frames: images.
         course: how the drive goes.
-        shape: rows and columns of a picture.
-        start: way along the road at the first picture, m.
+        shape: rows and columns of an image.
+        start: way along the road at the first image, m.
         geometry: of the road.
 
     Returns:

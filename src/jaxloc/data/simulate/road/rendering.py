@@ -1,7 +1,7 @@
 """A road with painted marks, wheel tracks and shadows, seen by a camera whose place in the lane is known exactly.
 
 What a road looks like is a function of the way along it, s, and of the place across it, n (m to the left of the lane's
-center). A picture takes several rays a pixel to the ground; what they show is averaged over the ground that each of
+center). An image takes several rays a pixel to the ground; what they show is averaged over the ground that each of
 them stands for, so that dashes and shadows far away do not alias.
 """
 
@@ -34,7 +34,7 @@ class Mark(eqx.Module):
         width: m.
         dash: painted length, m.
         gap: length between two dashes, m; 0 for a solid line.
-        brightness: grey level of the paint.
+        brightness: gray level of the paint.
         phase: way s at which a dash begins, m.
     """
 
@@ -68,7 +68,7 @@ class Streak(eqx.Module):
     Args:
         left: of the lane's center, m.
         sigma: half width, m.
-        depth: grey levels by which it is darker.
+        depth: gray levels by which it is darker.
         wander: standard deviation of its place along the road, m.
     """
 
@@ -78,7 +78,7 @@ class Streak(eqx.Module):
     wander: float = 0.03
 
     def darken(self, s: Points, n: Points, across: Points) -> Points:
-        """Grey levels to take away."""
+        """Gray levels to take away."""
         phase = np.float32(2.7 * self.left)
         sway = np.sin(s / 3.1 + phase) + np.sin(s / 7.7 + 2.0 * phase) + np.sin(s / 19.0 + 3.0 * phase)
         variance = np.float32(self.sigma**2) + across**2 / 12.0
@@ -125,10 +125,10 @@ class Road(eqx.Module):
         marks: painted lines; by default dashes on the left border of a lane 3.6 m wide, and a solid right border.
         streaks: wheel tracks and oil.
         shadows: None for an overcast day.
-        asphalt: its grey level.
-        grain: standard deviation of the grey levels of asphalt seen from near.
+        asphalt: its gray level.
+        grain: standard deviation of the gray levels of asphalt seen from near.
         edges: where asphalt ends and grass begins, left and right, m to the left of the lane's center.
-        grass: its grey level.
+        grass: its gray level.
         change: another road that follows, or None.
         seed: of texture and shadows.
 
@@ -157,7 +157,7 @@ class Road(eqx.Module):
         return dataclasses.replace(self, change=Change(road, start, length))
 
     def shade(self, s: Points, n: Points, along: Points, across: Points) -> Points:
-        """Grey levels of the road.
+        """Gray levels of the road.
 
         Args:
             s: way along the road, m.
@@ -198,7 +198,7 @@ def render(
     seed: int = 0,
     geometry: RoadGeometry = SmallAngles(),
 ) -> Float32[np.ndarray, "h w"]:
-    """A picture of a road.
+    """An image of a road.
 
     Args:
         road: what it looks like.
@@ -206,19 +206,19 @@ def render(
         ground: the camera, with its lens, height, pitch and roll.
         shape: rows and columns.
         travelled: way s of the vehicle along the road, m.
-        noise: standard deviation of a grey level of the sensor.
+        noise: standard deviation of a gray level of the sensor.
         seed: of that noise.
         geometry: how points of the ground get their place along and across the road.
 
     Returns:
-        Grey levels, 0 to 255; sky above the horizon. The same arguments give the same picture.
+        Gray levels, 0 to 255; sky above the horizon. The same arguments give the same image.
 
     Example:
         >>> import jaxloc as jl
         >>> from jaxloc.data.simulate.road.rendering import Road, render
         >>> ground = jl.sensors.GroundCamera(jl.sensors.Pinhole(60.0, 60.0, 39.5, 29.5), height=1.3, pitch=0.05)
-        >>> picture = render(Road(), jl.lanes.Lane(0.2, 0.0, 1e-3), ground, shape=(60, 80))
-        >>> picture.shape, bool(picture[:20].mean() > picture[40:].mean())  # the sky is brighter
+        >>> image = render(Road(), jl.lanes.Lane(0.2, 0.0, 1e-3), ground, shape=(60, 80))
+        >>> image.shape, bool(image[:20].mean() > image[40:].mean())  # the sky is brighter
         ((60, 80), True)
     """
     rays = 3
@@ -272,7 +272,7 @@ def _tile(seed: int, number: int) -> Float32[np.ndarray, "a b"]:
 
 
 def _remap(tile: Float32[np.ndarray, "a b"], u: Points, v: Points) -> Points:
-    """Bilinear values of an image at any number of places: OpenCV wants them as a picture that is not too long."""
+    """Bilinear values of an image at any number of places: OpenCV wants them as an image that is not too long."""
     places = [np.pad(part, (0, -part.size % 1024)).reshape(-1, 1024) for part in (u, v)]
     return cv2.remap(tile, *places, cv2.INTER_LINEAR).reshape(-1)[: u.size]
 
