@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._linalg import matmul
 from jaxloc.alignment.correlation.peaks import find_peaks
 from jaxloc.images.interpolation import Bicubic, sample
 from jaxloc.images.normalization import as_gray
 from jaxloc.images.spectrum import LogPolar, amplitude, hann
 from jaxloc.images.warps import Similarity, Translation
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers import Estimate, Status
 
 _LEAST_HEIGHT = 6.0  # of a trusted peak, in standard deviations of the surface of unrelated images

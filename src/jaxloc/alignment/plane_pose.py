@@ -6,11 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._linalg import matmul
 from jaxloc.images.interpolation import Bicubic, sample_components
 from jaxloc.images.normalization import as_gray
 from jaxloc.images.pyramid import gaussian_pyramid
 from jaxloc.poses import SE3
-from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors import Pinhole, TexturedPlane
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Problem, Quadratic, solve
 from jaxloc.solvers.cholesky import factor

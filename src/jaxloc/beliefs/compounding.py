@@ -5,8 +5,9 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.gaussian import Gaussian
-from jaxloc.poses.lie_group import Group, matmul
+from jaxloc.poses.lie_group import Group
 
 
 @eqx.filter_jit

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.square_root import cholesky, solve, whiten
 from jaxloc.poses import local, retract, tangent_dimension
-from jaxloc.poses.lie_group import matmul
 
 
 class Gaussian(eqx.Module):

@@ -9,10 +9,10 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.gaussian import Gaussian
 from jaxloc.beliefs.square_root import cholesky
 from jaxloc.poses import is_flat, local, retract, tangent_dimension
-from jaxloc.poses.lie_group import matmul
 
 _MEAN_STEPS = 3
 _ROUNDING = 1e-5  # of a covariance, relative to its largest eigenvalue

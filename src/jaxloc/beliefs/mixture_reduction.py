@@ -15,10 +15,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.mixture import Mixture
 from jaxloc.beliefs.square_root import whiten
 from jaxloc.poses import carry, is_flat, local, retract
-from jaxloc.poses.lie_group import matmul
 
 
 class Closeness(eqx.Module):

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.square_root import cholesky, whiten
 from jaxloc.poses import local, retract, tangent_dimension
-from jaxloc.poses.lie_group import matmul
 
 
 class Motion(eqx.Module):

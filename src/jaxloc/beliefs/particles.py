@@ -8,10 +8,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.gaussian import Gaussian
 from jaxloc.beliefs.models import dtype_of
 from jaxloc.poses import SE2, SE3, SO2, SO3, local, retract
-from jaxloc.poses.lie_group import Group, matmul
+from jaxloc.poses.lie_group import Group
 
 NOTHING = -1e30  # log weight of a particle without weight: finite, so that sums and gradients of it are
 _SQUARINGS = 5
@@ -168,7 +170,7 @@ class Particles(eqx.Module):
         """Tangents that lead from a value to each particle; zero where there is none."""
 
         def one(value, there):
-            return local(center, jax.tree.map(lambda new, old: jnp.where(there, new, old), value, center))
+            return local(center, tree.where(there, value, center))
 
         return jax.vmap(one)(self.values, self.valid)
 

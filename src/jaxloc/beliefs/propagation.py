@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.gaussian import Gaussian
 from jaxloc.beliefs.square_root import cholesky
 from jaxloc.poses import is_flat, local, retract
-from jaxloc.poses.lie_group import matmul
 
 _MEAN_STEPS = 3  # of the intrinsic mean on a manifold; the error shrinks as the square of the spread each time
 

@@ -9,7 +9,7 @@ from jax.custom_batching import custom_vmap
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
-from jaxloc.poses.lie_group import matmul
+from jaxloc._linalg import matmul
 
 _UNROLLED = 9  # up to here a loop of column steps beats the library call under vmap
 _UNROLLED_ROWS = 14  # the same for orthogonal factorizations

@@ -9,6 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._linalg import matmul
 from jaxloc.features.harris import Box
 from jaxloc.features.keypoints import Descriptors, Keypoints
 
@@ -202,7 +203,7 @@ def select_tests(bits: Bool[Array, "m k"], *, count: int = 256, limit: float = 0
     # A test that always comes out alike tells nothing: it counts as correlated with all.
     some = length > 0
     centered = centered / jnp.where(some, length, 1.0)[None, :]
-    alike = jnp.abs(jnp.matmul(centered.T, centered, precision="highest"))
+    alike = jnp.abs(matmul(centered.T, centered))
     alike = jnp.where(some[:, None] & some[None, :], alike, 1.0)[order][:, order]
 
     def choose(most: Array) -> Bool[Array, " k"]:

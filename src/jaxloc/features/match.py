@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, UInt8
 
+from jaxloc._linalg import matmul
 from jaxloc.features.keypoints import Descriptors, Matches, Nearest
 
 
@@ -46,7 +47,7 @@ def euclidean_distances(first: Float[Array, "n d"], second: Float[Array, "m d"])
         >>> euclidean_distances(jnp.zeros((1, 2)), jnp.array([[3.0, 4.0]])).tolist()
         [[5.0]]
     """
-    dot = jnp.matmul(first, second.T, precision="highest")
+    dot = matmul(first, second.T)
     squared = jnp.sum(first * first, axis=1)[:, None] + jnp.sum(second * second, axis=1)[None, :] - 2.0 * dot
     apart = squared > 0
     return jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0)

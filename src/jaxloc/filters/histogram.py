@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, Motion, Sensor
 from jaxloc.beliefs.models import innovation
 from jaxloc.filters.interface import Filter, FilterState, Info
 from jaxloc.filters.kalman import finite_or_zero, select
 from jaxloc.filters.unscented import intrinsic_mean
 from jaxloc.poses import SE2
-from jaxloc.poses.lie_group import matmul
 
 
 class Cells(eqx.Module):

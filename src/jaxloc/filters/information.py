@@ -7,12 +7,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, Motion, Sensor
 from jaxloc.beliefs.models import innovation
 from jaxloc.beliefs.square_root import cholesky, solve, triangularize, whiten
 from jaxloc.filters.interface import Filter, FilterState, GaussianState, Info
 from jaxloc.filters.kalman import finite_or_zero, noise_root, select
-from jaxloc.poses.lie_group import matmul
 
 
 class InformationState(FilterState):

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian
-from jaxloc.poses.lie_group import matmul
 
 
 class FilterState(eqx.Module):
@@ -161,7 +162,7 @@ def run(
         moved = filt.predict(before, control, key=keys[0])
         after, info = filt.update(moved, measurement, valid_here & here, key=keys[1])
         if active is not None:
-            after = jax.tree.map(lambda new, old: jnp.where(here, new, old), after, before)
+            after = tree.where(here, after, before)
         return after, History(keep(after), info)
 
     return lax.scan(advance, state, (controls, measurements, valid, there))

@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
+from jaxloc import _tree as tree
 from jaxloc.beliefs import Gaussian, Motion, Sensor, chi2_quantile
 from jaxloc.beliefs.models import innovation, mask_covariance
 from jaxloc.beliefs.square_root import cholesky, downdate, product, triangularize, whiten
@@ -268,7 +269,7 @@ def recenter(mean: Any, delta: Float[Array, " d"], root: Float[Array, "d d"]) ->
 
 def select(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
     """One of two pytrees, leaf by leaf."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+    return tree.where(condition, new, old)
 
 
 def finite_or_zero(value: Any) -> Any:

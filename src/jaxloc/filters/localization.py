@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
 from jaxloc.beliefs import Gaussian, KLDSize, Motion, Particles, Sensor
 from jaxloc.beliefs.particles import finite_log_weights
 from jaxloc.beliefs.resampling.indices import systematic
@@ -225,7 +226,7 @@ class MonteCarloLocalization(Filter):
         logs = jnp.where(jnp.isfinite(logs), logs, float(jnp.finfo(logs.dtype).min) * 1e-3)
         exponent = self._exponent(before, logs)
         weighed = Particles(before.values, before.log_weights + exponent * logs, before.valid).normalize()
-        particles = jax.tree.map(lambda new, old: jnp.where(ok, new, old), weighed, before)
+        particles = tree.where(ok, weighed, before)
         fit, inject = self._follow(state, jnp.sum(jnp.where(weighed.weights > 0, weighed.weights * logs, 0.0)))
         after = LocalizationState(
             particles,

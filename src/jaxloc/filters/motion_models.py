@@ -7,9 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Motion
 from jaxloc.poses import retract, series, tangent_dimension
-from jaxloc.poses.lie_group import Group, as_floats, matmul
+from jaxloc.poses.lie_group import Group, as_floats
 
 
 class LinearMotion(Motion):

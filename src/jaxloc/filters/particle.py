@@ -10,6 +10,7 @@ from jax import lax
 from jax.sharding import AxisType
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
 from jaxloc.beliefs import Motion, Particles, Sensor
 from jaxloc.beliefs.kld_sampling import KLDSize
 from jaxloc.beliefs.particles import NOTHING
@@ -159,7 +160,7 @@ class ParticleFilter(Filter):
         choice = weighed.choice or Choice(state.particles, state.ancestors, state.resampled)
         after = ParticleState(particles, choice.ancestors, choice.resampled, weighed.draft, state.step)
         there = jnp.any(valid)
-        after = jax.tree.map(lambda new, old: jnp.where(there, new, old), after, state)
+        after = tree.where(there, after, state)
         floor = math.log(float(jnp.finfo(particles.log_weights.dtype).tiny))
         likelihood = jnp.where(ok, weighed.particles.log_total, floor)
         info = ParticleInfo(

@@ -10,12 +10,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Motion, Particles, Sensor
 from jaxloc.beliefs.models import dtype_of, innovation, log_normal, mask_covariance
 from jaxloc.beliefs.particles import NOTHING
 from jaxloc.beliefs.square_root import cholesky, whiten
 from jaxloc.poses import local, retract, tangent_dimension
-from jaxloc.poses.lie_group import matmul
 
 
 class Draft(eqx.Module):
@@ -361,4 +362,4 @@ def _first(values: Any) -> Any:
 
 
 def _where(condition: Array, new: Any, old: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+    return tree.where(condition, new, old)

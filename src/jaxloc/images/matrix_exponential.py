@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxloc.poses.lie_group import matmul
+from jaxloc._linalg import matmul
 
 _HALVINGS, _TERMS = 4, 9
 _ROOTS, _ROOT_STEPS, _ODD_TERMS = 3, 7, 7

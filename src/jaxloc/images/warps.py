@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.images.matrix_exponential import exponential_less_identity, logarithm
 from jaxloc.poses import SE2
-from jaxloc.poses.lie_group import Group, matmul
+from jaxloc.poses.lie_group import Group
 
 _LABELS = ("right", "down", "rotation", "scale", "stretch", "shear", "perspective right", "perspective down")
 _FAR = -1e6  # where points at or beyond the horizon go: outside every image, px

@@ -11,8 +11,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3, Direction
-from jaxloc.poses.lie_group import matmul, skew
+from jaxloc.poses.lie_group import skew
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Problem, Quadratic
 

@@ -15,9 +15,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.multiview.epipolar import RelativePose, depth_signs, null_vector, unit_rays
 from jaxloc.poses import SO3, Direction, retract
-from jaxloc.poses.lie_group import matmul, skew
+from jaxloc.poses.lie_group import skew
 from jaxloc.solvers.cholesky import factor
 
 _ROOT_STEPS = 25

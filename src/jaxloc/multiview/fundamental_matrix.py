@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.multiview.epipolar import homogeneous
 from jaxloc.multiview.homography import normalizer
-from jaxloc.poses.lie_group import matmul
 
 _LEAST, _MINIMAL = 8, 7
 _POLISH_STEPS = 3

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.images import Homography
 from jaxloc.poses import SE3, Direction
-from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Loss, Problem, Quadratic, Tukey, ransac, solve
 

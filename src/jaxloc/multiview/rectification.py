@@ -4,10 +4,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.images import Homography
 from jaxloc.multiview.epipolar import null_vector
 from jaxloc.poses import SE3, SO3
-from jaxloc.poses.lie_group import matmul, skew
+from jaxloc.poses.lie_group import skew
 from jaxloc.sensors import Pinhole, StereoRig
 from jaxloc.solvers.cholesky import factor
 

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, gate, propagate_sampled, propagate_unscented
 from jaxloc.beliefs.square_root import cholesky
-from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors import StereoRig
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.multiview.epipolar import (
     EpipolarError,
     RelativePose,
@@ -19,7 +20,6 @@ from jaxloc.multiview.epipolar import (
 from jaxloc.multiview.five_point import decompose, essential_candidates, facing
 from jaxloc.multiview.homography import transfer_error
 from jaxloc.poses import retract
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Loss, Status, Tukey, align_points, solve
 from jaxloc.solvers.cholesky import factor
 from jaxloc.solvers.ransac import sample_indices

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, gate
 from jaxloc.beliefs.square_root import cholesky, whiten
 from jaxloc.images.patches import extract
@@ -17,7 +18,6 @@ from jaxloc.multiview.stereo_triangulation import triangulate
 from jaxloc.odometry.stereo_matching import StereoFeatures
 from jaxloc.odometry.visual_odometry import CameraMotion
 from jaxloc.poses import SE3
-from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement import StereoMatches
 from jaxloc.sensors import StereoRig
 

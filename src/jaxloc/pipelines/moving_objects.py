@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Closeness, Gaussian, MahalanobisDistance, Mixture
 from jaxloc.filters import ConstantVelocity, KalmanFilter
 from jaxloc.odometry import CameraMotion, FlowOptions, GroupOptions, MovingObjects, find_moving, group_points
@@ -270,7 +271,7 @@ def _track(
     config: Config,
 ) -> tuple[PhdState, Targets, Float[Array, "k 2"], Bool[Array, " k"], Float[Array, ""], MovingObject]:
     """A step of the filter: its state, the targets, where in the image and if in view, how many, what was measured."""
-    turned = jnp.matmul(objects.velocities, pose.mean.rotation.matrix().T, precision="highest")
+    turned = matmul(objects.velocities, pose.mean.rotation.matrix().T)
     measured = jax.vmap(MovingObject)(pose.mean.apply(objects.positions), turned)
     tracker = build_tracker(rig, pose, span, size, config)
     state, info = tracker.update(tracker.predict(state, dt), measured, objects.valid & usable)

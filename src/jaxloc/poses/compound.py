@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxloc.poses.lie_group import matmul
+from jaxloc._linalg import matmul
 from jaxloc.poses.se2 import SE2
 
 

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import series
-from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.poses.lie_group import as_floats
 
 # Coefficients of asin(x) / x in x^2.
 _ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)

@@ -14,11 +14,6 @@ def as_floats(*values: Any) -> list[Array]:
     return [jnp.asarray(value, dtype) for value in values]
 
 
-def matmul(a: Array, b: Array) -> Array:
-    """Matrix product at full precision: accelerators otherwise round the factors of geometry to 10 bits."""
-    return jnp.matmul(a, b, precision="highest")
-
-
 def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """The cross-product matrix: ``skew(a) @ b == cross(a, b)``."""
     x, y, z = v[0], v[1], v[2]

@@ -5,8 +5,9 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import series
-from jaxloc.poses.lie_group import Group, as_floats, matmul, skew
+from jaxloc.poses.lie_group import Group, as_floats, skew
 from jaxloc.poses.so3 import SO3
 
 

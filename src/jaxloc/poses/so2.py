@@ -5,7 +5,8 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxloc.poses.lie_group import Group, as_floats, matmul
+from jaxloc._linalg import matmul
+from jaxloc.poses.lie_group import Group, as_floats
 
 
 class SO2(Group):

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import SE2, SE3
-from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement.attributes import Attribute, Blocks, CornerStrength, Curvature, Identity
 from jaxloc.refinement.correspondences import Correspondences, PointPoint, refine
 from jaxloc.solvers import GemanMcClure, assign

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxloc.poses.lie_group import matmul
+from jaxloc._linalg import matmul
 
 
 class Attribute(eqx.Module):

@@ -10,8 +10,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import SE2, SE3
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers import Linearization
 
 

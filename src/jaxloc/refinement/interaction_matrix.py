@@ -9,8 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import Direction
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers import Linearization, Problem, Quadratic
 from jaxloc.solvers.cholesky import factor
 

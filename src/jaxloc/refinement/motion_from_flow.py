@@ -25,8 +25,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import Direction
-from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement.interaction_matrix import (
     DirectionalFlow,
     FlowOfTwist,

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
-from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors import Pinhole, StereoRig
 from jaxloc.solvers import Linearization, Problem, Quadratic
 from jaxloc.solvers.problem import is_quadratic

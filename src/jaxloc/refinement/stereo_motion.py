@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.multiview import stereo_triangulation
 from jaxloc.poses import SE3
 from jaxloc.refinement.pnp import _usable
@@ -119,14 +120,14 @@ def motion_problem(rig: StereoRig, matches: StereoMatches, pose: SE3, loss: Any)
     believed = matches.previous
     for _ in range(2):
         transfer, predicted = _transfer(rig, pose, believed, usable)
-        shift = _product(transfer, (matches.previous - believed)[..., None])[..., 0]
+        shift = matmul(transfer, (matches.previous - believed)[..., None])[..., 0]
         error = matches.current - predicted - shift
-        total = matches.covariance_current + _product(transfer, _product(matches.covariance_previous, transfer.mT))
+        total = matches.covariance_current + matmul(transfer, matmul(matches.covariance_previous, transfer.mT))
         whiten = whitener(total)
         believed = _agreeing_measurement(rig, matches, transfer, whiten, error, believed)
     transfer, _ = _transfer(rig, pose, believed, usable)
-    shift = _product(transfer, (matches.previous - believed)[..., None])[..., 0]
-    total = matches.covariance_current + _product(transfer, _product(matches.covariance_previous, transfer.mT))
+    shift = matmul(transfer, (matches.previous - believed)[..., None])[..., 0]
+    total = matches.covariance_current + matmul(transfer, matmul(matches.covariance_previous, transfer.mT))
     points = rig.triangulate(believed)
     return StereoReprojection(rig, points.T, (matches.current - shift).T, whitener(total), usable, loss)
 
@@ -141,7 +142,7 @@ def _transfer(
     back = pose.rotation.matrix().T
     to_point = jax.vmap(lambda z: stereo_triangulation.stereo_jacobian(rig, z))(believed)
     by_point = jnp.transpose(stereo_jacobian(rig, c), (2, 1, 0))
-    transfer = _product(by_point, _product(back[None], to_point))
+    transfer = matmul(by_point, matmul(back[None], to_point))
     return jnp.where(seen[:, None, None], transfer, 0.0), rig.project_components(*c).T
 
 
@@ -150,12 +151,12 @@ def _agreeing_measurement(
 ) -> Float[Array, "n 3"]:
     """The previous measurement moved to where both frames agree best; that of outliers stays."""
     w = jnp.moveaxis(whiten, -1, 0)
-    whitened = _product(w, error[..., None])
-    gain = _product(matches.covariance_previous, _product(w, transfer).mT)
-    moved = matches.previous + _product(gain, whitened)[..., 0]
+    whitened = matmul(w, error[..., None])
+    gain = matmul(matches.covariance_previous, matmul(w, transfer).mT)
+    moved = matches.previous + matmul(gain, whitened)[..., 0]
     plausible = jnp.sum(whitened[..., 0] ** 2, axis=1) < 25.0
     return jnp.where((plausible & rig.has_depth(moved))[:, None], moved, believed)
 
 
-def _product(a: Array, b: Array) -> Array:
-    return jnp.matmul(a, b, precision="highest")
+def matmul(a: Array, b: Array) -> Array:
+    return matmul(a, b)

@@ -6,8 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
-from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.lenses import Lens
 
 _NEAREST = 1e-6  # points nearer than this to the plane of the camera have no image, m

@@ -6,8 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3
-from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.camera import Pinhole
 
 _GRAZING = 1e-4  # rays that sink less than this by unit depth are taken not to meet the ground

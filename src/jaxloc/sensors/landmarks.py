@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _tree as tree
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Sensor
 from jaxloc.poses import SE2, SO2
-from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.poses.lie_group import as_floats
 
 _NEAREST = 1e-3  # m: closer than this no bearing means anything
 
@@ -191,7 +193,7 @@ def sanitize(reading: RangeBearing, valid: Bool[Array, ""]) -> tuple[RangeBearin
     values = jnp.stack([reading.range, reading.bearing.cos, reading.bearing.sin])
     usable = valid & jnp.all(jnp.isfinite(values)) & (reading.range > 0.0)
     stand_in = jnp.ones_like(reading.range), SO2.identity(reading.range.dtype)
-    safe = jax.tree.map(lambda x, y: jnp.where(usable, x, y), (reading.range, reading.bearing), stand_in)
+    safe = tree.where(usable, (reading.range, reading.bearing), stand_in)
     return RangeBearing(*safe, reading.landmark), usable
 
 

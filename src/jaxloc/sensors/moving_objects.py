@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Sensor
 from jaxloc.poses import SE3
-from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.stereo_rig import StereoRig
 
 _NEAREST = 1.0  # m: nearer states are measured as well as those

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.models import Motion, log_normal
 from jaxloc.poses import SE2, local
-from jaxloc.poses.lie_group import matmul
 
 _NO_WAY = 0.01  # below this distance the direction driven says nothing about a turn, m
 

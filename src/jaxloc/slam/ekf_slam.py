@@ -19,12 +19,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, Motion, gate
 from jaxloc.beliefs.models import innovation, mask_covariance
 from jaxloc.beliefs.square_root import cholesky, solve, whiten
 from jaxloc.filters import Filter, FilterState, Info
 from jaxloc.poses import SE2
-from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.landmarks import RangeBearing, locate, locate_covariance, observe, polar_jacobian, sanitize
 
 _QUARTER = ((0.0, -1.0), (1.0, 0.0))  # turns a vector counter-clockwise by a right angle
@@ -276,7 +278,7 @@ def _retract(state: SlamState, error: Float[Array, " d"]) -> tuple[SE2, Float[Ar
 
 
 def _choose(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+    return tree.where(condition, yes, no)
 
 
 def _is_finite(state: SlamState) -> Bool[Array, ""]:

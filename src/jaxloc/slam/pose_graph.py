@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxloc.poses.lie_group import matmul
+from jaxloc._linalg import matmul
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Problem, Quadratic, solve
 from jaxloc.solvers.gauss_newton import Solver
 

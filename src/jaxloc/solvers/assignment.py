@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _tree as tree
+
 _ROUNDS = 3  # of bidding: beyond these, paths are quicker
 
 
@@ -207,7 +209,7 @@ def _grow(costs: Array, stay: Array, search: _Search) -> _Search:
         handed=handed,
     )
     finished = done & (handed < 0)
-    return jax.tree.map(lambda a, b: jnp.where(finished, a, b), _next_row(grown), grown)
+    return tree.where(finished, _next_row(grown), grown)
 
 
 def _hand_back(search: _Search) -> _Search:
@@ -224,7 +226,7 @@ def _hand_back(search: _Search) -> _Search:
             before,
         ),
     )
-    return jax.tree.map(lambda a, b: jnp.where(before < 0, a, b), _next_row(handed), handed)
+    return tree.where(before < 0, _next_row(handed), handed)
 
 
 def _next_row(search: _Search) -> _Search:

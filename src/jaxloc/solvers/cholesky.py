@@ -14,7 +14,7 @@ import lineax as lx
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from jaxloc.poses.lie_group import matmul
+from jaxloc._linalg import matmul
 
 UNROLLED = 9
 

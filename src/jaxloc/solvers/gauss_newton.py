@@ -18,6 +18,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _tree as tree
 from jaxloc.poses import retract
 from jaxloc.solvers.cholesky import Cholesky, factor
 from jaxloc.solvers.estimate import Status
@@ -285,7 +286,7 @@ def _weighted_rows(problem: Problem, y: Any, scale: Float[Array, " d"]) -> tuple
 
 
 def _where(accept: Bool[Array, ""], new: Any, old: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, old)
+    return tree.where(accept, new, old)
 
 
 def _as(leaf: Any, dtype: Any) -> Any:

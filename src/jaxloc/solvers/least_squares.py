@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import retract, tangent_dimension
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers.cholesky import factor
 from jaxloc.solvers.estimate import Estimate, Status
 from jaxloc.solvers.gauss_newton import GaussNewton, Solver, TangentSolver

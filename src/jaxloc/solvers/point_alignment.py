@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import SE2, SE3, SO2, SO3
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers.cholesky import rank_tolerance
 from jaxloc.solvers.estimate import Estimate, Status
 from jaxloc.solvers.least_squares import attach_gradient, covariance, trusted

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import retract, tangent_dimension
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers.cholesky import factor
 from jaxloc.solvers.robust_kernels import Loss, Quadratic
 

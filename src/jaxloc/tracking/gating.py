@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import chi2_quantile
 from jaxloc.beliefs.models import innovation
 from jaxloc.beliefs.square_root import product, whiten
 from jaxloc.filters import GaussianState
 from jaxloc.filters.kalman import GaussianFilter, finite_or_zero, recenter, regular
-from jaxloc.poses.lie_group import matmul
 
 
 class Comparison(eqx.Module):

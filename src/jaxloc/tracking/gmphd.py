@@ -13,11 +13,12 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Closeness, MahalanobisDistance, Mixture, Motion, reduce_mixture
 from jaxloc.filters import FilterState, GaussianState, History
 from jaxloc.filters import run as run_filter
 from jaxloc.filters.kalman import finite_or_zero, spread_motion
-from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.poses.lie_group import as_floats
 from jaxloc.tracking.gating import Comparison, compare, corrected, count_valid, with_room
 from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
 from jaxloc.tracking.models.birth import MeasuredBirth

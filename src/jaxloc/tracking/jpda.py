@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Mixture
-from jaxloc.poses.lie_group import matmul
 from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
 from jaxloc.tracking.likelihood_ratio import examine
 from jaxloc.tracking.models.target import TargetModel

@@ -14,10 +14,10 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Mixture
 from jaxloc.filters import FilterState
 from jaxloc.filters.kalman import select
-from jaxloc.poses.lie_group import matmul
 from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
 from jaxloc.tracking.likelihood_ratio import Scan, correct_tracks, examine, whole
 from jaxloc.tracking.models.target import TargetModel

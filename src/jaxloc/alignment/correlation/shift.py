@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.alignment.correlation.scores import NormalizedCorrelation, Pair, Score, SumOfSquares
 from jaxloc.images.gradients import central_difference
 from jaxloc.images.interpolation import Bicubic
 from jaxloc.images.patches import extract
-from jaxloc.poses.lie_group import matmul
 
 _LEAST_SIGMA = 0.01  # what interpolation errs by without noise, px
 STEPS = 4

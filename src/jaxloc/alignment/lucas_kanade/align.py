@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc import _tree as tree
 from jaxloc.alignment.lucas_kanade.covariance import Evidence, conclude, follow_root
 from jaxloc.alignment.lucas_kanade.iteration import Descended, Limits, descend
 from jaxloc.alignment.lucas_kanade.normal_equations import zero_brightness
@@ -110,7 +111,7 @@ def finite_start(start: Warp) -> tuple[Warp, Bool[Array, ""]]:
     """The start without gradient, the identity if it has numbers that are none, and whether it has not."""
     finite = jnp.all(jnp.isfinite(start.matrix()))
     other = type(start).identity(start.matrix().dtype)
-    safe = jax.tree.map(lambda leaf, instead: jnp.where(finite, leaf, instead), start, other)
+    safe = tree.where(finite, start, other)
     return jax.lax.stop_gradient(safe), finite
 
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._linalg import matmul
 from jaxloc._xla import compute_once
 from jaxloc.alignment.lucas_kanade.formulations import through
 from jaxloc.alignment.lucas_kanade.interpolation_noise import passage
@@ -20,7 +21,6 @@ from jaxloc.alignment.lucas_kanade.options import LucasKanade
 from jaxloc.alignment.lucas_kanade.pyramid_level import Frame, Level
 from jaxloc.alignment.lucas_kanade.scales import Scaled
 from jaxloc.images.warps import Warp
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers.cholesky import factor
 from jaxloc.solvers.estimate import Status
 

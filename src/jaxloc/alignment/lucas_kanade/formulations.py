@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.alignment.lucas_kanade.pyramid_level import Level, derivatives
 from jaxloc.images.interpolation import AbstractInterpolation, sample_components
 from jaxloc.images.warps import Euclidean, Homography, Warp, tangent_matrix
-from jaxloc.poses.lie_group import matmul
 
 
 class Linearized(eqx.Module):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _tree as tree
 from jaxloc.alignment.lucas_kanade.normal_equations import Equations, Matching, Prepared, equations
 from jaxloc.alignment.lucas_kanade.pyramid_level import Level
 from jaxloc.alignment.lucas_kanade.steps import Descent
@@ -110,4 +111,4 @@ def travelled(level: Level, before: Warp, after: Warp) -> Float[Array, ""]:
 
 
 def _choose(accept: Bool[Array, ""], new: Any, old: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, old)
+    return tree.where(accept, new, old)

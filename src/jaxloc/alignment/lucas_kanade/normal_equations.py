@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.alignment.lucas_kanade.formulations import Formulation, Linearized
 from jaxloc.alignment.lucas_kanade.pyramid_level import Level
 from jaxloc.images.interpolation import AbstractInterpolation
 from jaxloc.images.warps import Warp
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers.cholesky import factor
 from jaxloc.solvers.robust_kernels import Loss, Quadratic
 

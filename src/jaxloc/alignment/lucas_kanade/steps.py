@@ -11,8 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.alignment.lucas_kanade.normal_equations import Equations
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers.cholesky import factor
 
 

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num
 
+from jaxloc import _tree as tree
+from jaxloc._linalg import matmul
 from jaxloc.alignment.lucas_kanade.pyramid_level import Frame
 from jaxloc.alignment.mutual_information.density import Binning, joint_density, log_ratio, pixel_weights
 from jaxloc.images.gradients import smooth
 from jaxloc.images.interpolation import Bicubic, sample
 from jaxloc.images.normalization import as_gray
 from jaxloc.images.warps import Warp
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers import Estimate, Status
 
 
@@ -233,7 +234,7 @@ def _climb(scale: _Scale, warp: Warp, method: MutualInformation) -> _Ascent:
         damping = jnp.where(better, jnp.where(first, at.damping, at.damping * 0.2), at.damping * 5.0)
         new = _Ascent(trial, information, gradient, hessian, damping, moved, at.count)
         old = _Ascent(at.warp, at.information, at.gradient, at.hessian, damping, moved, at.count)
-        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+        kept = tree.where(better, new, old)
         return eqx.tree_at(lambda a: a.count, kept, at.count + 1)
 
     return lax.while_loop(go_on, advance, start)
@@ -242,7 +243,7 @@ def _climb(scale: _Scale, warp: Warp, method: MutualInformation) -> _Ascent:
 @eqx.filter_jit
 def _align(image: Array, template: Array, weight: Array, start: Warp, method: MutualInformation) -> Estimate:
     finite = jnp.all(jnp.isfinite(start.matrix()))
-    safe = jax.tree.map(lambda a, b: jnp.where(finite, a, b), start, type(start).identity(image.dtype))
+    safe = tree.where(finite, start, type(start).identity(image.dtype))
     frame = Frame.of(template.shape)
     warp = frame.normalize(lax.stop_gradient(safe))
     scales = _scales(image, template, weight, method)

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._linalg import matmul
 from jaxloc.images.normalization import as_gray
-from jaxloc.poses.lie_group import matmul
 
 _LEAST_BINS = 5
 

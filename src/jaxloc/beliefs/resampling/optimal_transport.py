@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.particles import Particles
 from jaxloc.poses import retract
-from jaxloc.poses.lie_group import matmul
 
 
 def optimal_transport(

@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Motion, Sensor
 from jaxloc.beliefs.square_root import cholesky
 from jaxloc.filters import CoordinatedTurn, LinearMotion, LinearSensor
 from jaxloc.poses import SE2, SO2, retract
-from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors import RangeBearing
 from jaxloc.sensors.landmarks import observe, polar_jacobian
 

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
+
 
 class Alignment(eqx.Module):
     """How an estimated path is moved onto the true one before they are compared."""
@@ -64,12 +66,12 @@ def _umeyama(
     a, b = points - center[None], targets - target_center[None]
     # The alignment minimizes the sum of squares: its own change has no effect on it (envelope theorem), so the RMSE has
     # its exact gradient without that of the decomposition, which does not exist on a straight path.
-    covariance = jax.lax.stop_gradient(jnp.matmul((weights * b).T, a, precision="highest"))
+    covariance = jax.lax.stop_gradient(matmul((weights * b).T, a))
     u, spectrum, vt = jnp.linalg.svd(covariance)
     sign = jnp.where(jnp.linalg.det(u) * jnp.linalg.det(vt) < 0, -1.0, 1.0).astype(points.dtype)
     signs = jnp.ones(3, points.dtype).at[2].set(sign)
-    rotation = jnp.matmul(u * signs[None], vt, precision="highest")
+    rotation = matmul(u * signs[None], vt)
     variance = jax.lax.stop_gradient(jnp.sum(weights * a**2))
     scale = jnp.where(variance > 0, jnp.sum(spectrum * signs) / jnp.where(variance > 0, variance, 1.0), 1.0)
     scale = scale if with_scale else 1.0
-    return scale * jnp.matmul(a, rotation.T, precision="highest") + target_center[None]
+    return scale * matmul(a, rotation.T) + target_center[None]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxloc.poses.lie_group import matmul
+from jaxloc._linalg import matmul
 
 _TOGETHER = 64
 

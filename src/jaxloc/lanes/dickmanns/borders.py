@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian
 from jaxloc.lanes.dickmanns.edges import EdgeDetector, LightStripe, find_edge
 from jaxloc.lanes.dickmanns.model import BorderSensor, RoadState
 from jaxloc.lanes.dickmanns.windows import Windows, sum_columns
-from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors.ground_camera import GroundCamera
 
 

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.lanes.ground_view import GroundView
 from jaxloc.lanes.ralph.profile import LaneFit, normalize_rows, shift_rows
 from jaxloc.lanes.ralph.template import Template
-from jaxloc.poses.lie_group import matmul
 from jaxloc.solvers import Estimate, LevenbergMarquardt, solve
 from jaxloc.solvers.cholesky import factor
 from jaxloc.solvers.gauss_newton import Solver

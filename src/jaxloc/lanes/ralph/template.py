@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _tree as tree
 from jaxloc.lanes.ground_view import GroundView, halve_columns
 from jaxloc.lanes.ralph.profile import LaneFit, straighten
 from jaxloc.poses.lie_group import as_floats
@@ -153,4 +154,4 @@ class Predictive(Adaptation):
 
 
 def _keep_unless(ok: Bool[Array, ""], new: Template, old: Template) -> Template:
-    return jax.tree.map(lambda a, b: jnp.where(ok, a, b), new, old)
+    return tree.where(ok, new, old)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _tree as tree
 from jaxloc.poses import SE3
 from jaxloc.refinement.bundle.estimate import BundleEstimate
 from jaxloc.refinement.bundle.gradient import attach_gradient
@@ -164,7 +165,7 @@ def _iterate(
         cost = problem.cost(moved)
         gain = (before - cost) / jnp.maximum(predicted, jnp.finfo(dtype).tiny)
         better = (cost < before) & (gain > 0)
-        value = jax.tree.map(lambda new, old: jnp.where(better, new, old), moved, state.value)
+        value = tree.where(better, moved, state.value)
         shrink = jnp.clip(1.0 - (2.0 * gain - 1.0) ** 3, 0.1, 1.0)
         damping = jnp.where(better, state.damping * shrink, state.damping * state.growth)
         small = (predicted <= rtol * before) | (damping > 1.0 / jnp.finfo(dtype).eps)
@@ -200,7 +201,7 @@ def _conclude(problem: BundleProblem, structure: Structure, ended: _State, clean
     moved = ended.value.moved(delta.cameras, delta.points)
     small = -gradient.dot(delta) <= 1e-6 * cost
     usual = ended.done & ~eliminated.deficient & small
-    value = jax.tree.map(lambda new, old: jnp.where(usual, new, old), moved, ended.value)
+    value = tree.where(usual, moved, ended.value)
     rays = structure.by_point.sum(problem.usable.astype(cost.dtype)[:, None])[:, 0]
     status = jnp.where(ended.done, int(Status.CONVERGED), int(Status.MAX_STEPS))
     status = jnp.where(problem.admissible(value), status, int(Status.INADMISSIBLE))

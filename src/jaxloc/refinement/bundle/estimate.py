@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import SE3
-from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement.bundle.problem import Bundle, BundleProblem
 from jaxloc.refinement.bundle.schur import Eliminated, Tangent, eliminate, normal_equations, score_products
 from jaxloc.refinement.bundle.structure import Structure

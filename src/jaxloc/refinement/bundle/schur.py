@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxloc.poses.lie_group import matmul
+from jaxloc._linalg import matmul
 from jaxloc.refinement.bundle.problem import Bundle, BundleProblem, Sights, pose_rows
 from jaxloc.refinement.bundle.structure import Structure, with_zero
 from jaxloc.solvers.cholesky import Factor, factor, rank_tolerance

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
-from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement.calibration.model import Intrinsics, Parametrization
 from jaxloc.refinement.calibration.problem import BoardProblem, CameraProblem, Unknowns
 from jaxloc.refinement.calibration.zhang import Views, closed_form, extent, safe_views

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxloc.poses.lie_group import matmul
+from jaxloc._linalg import matmul
 from jaxloc.sensors import BrownConrady, KannalaBrandt, Pinhole
 from jaxloc.sensors.lenses import Lens
 

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, retract, tangent_dimension
-from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement.calibration.model import Parametrization
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Linearization, Problem, Quadratic

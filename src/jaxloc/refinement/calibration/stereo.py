@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3
-from jaxloc.poses.lie_group import matmul
 from jaxloc.refinement.calibration.camera import carried, check_corners, fit, prepare
 from jaxloc.refinement.calibration.model import Intrinsics
 from jaxloc.refinement.calibration.problem import CameraProblem, Rig, StereoProblem, Unknowns

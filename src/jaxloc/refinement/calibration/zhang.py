@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.multiview.homography import direct_linear_transform
 from jaxloc.poses import SE3, SO3
-from jaxloc.poses.lie_group import matmul
 
 _FEWEST_CORNERS = 6
 

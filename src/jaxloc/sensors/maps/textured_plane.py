@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.images.interpolation import AbstractInterpolation, Bilinear, sample
 from jaxloc.images.warps import Homography
 from jaxloc.poses import SE3
-from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors.camera import Pinhole
 
 

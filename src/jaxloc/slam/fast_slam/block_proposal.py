@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.square_root import cholesky, solve
 from jaxloc.poses import retract
-from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors.landmarks import RangeBearing, locate
 from jaxloc.slam.fast_slam.association import associate, log_density
 from jaxloc.slam.fast_slam.landmark_filter import LandmarkFilter, Landmarks, Prediction

@@ -10,10 +10,11 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, Motion, Particles, resampling
 from jaxloc.filters.interface import Filter, Info
 from jaxloc.poses import SE2
-from jaxloc.poses.lie_group import as_floats, matmul
+from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.landmarks import RangeBearing, sanitize
 from jaxloc.slam.fast_slam.association import Candidates
 from jaxloc.slam.fast_slam.landmark_filter import LandmarkFilter, Landmarks

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.square_root import cholesky, solve
 from jaxloc.poses import SE2
-from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors.landmarks import RangeBearing, locate, locate_covariance, observe, polar_jacobian
 
 LIKELY = 0.999  # probability of the gate

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._linalg import matmul
 from jaxloc.beliefs.square_root import cholesky, solve
 from jaxloc.poses import SE2, retract
-from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors.landmarks import RangeBearing
 from jaxloc.slam.fast_slam.association import Association, Candidates, associate, log_density
 from jaxloc.slam.fast_slam.landmark_filter import LandmarkFilter, Landmarks

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.alignment.correlation import Window, search
 from jaxloc.images.interpolation import Bilinear, sample_components
 from jaxloc.images.warps import Translation
 from jaxloc.poses import SE2
-from jaxloc.poses.lie_group import matmul
 from jaxloc.slam.mosaic.view import Patch
 from jaxloc.solvers import Estimate, GemanMcClure, Linearization, Problem, Quadratic, solve
 

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.images.warps import Euclidean
 from jaxloc.poses import SE2
-from jaxloc.poses.lie_group import matmul
 
 
 class Raster(eqx.Module):

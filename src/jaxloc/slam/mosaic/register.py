@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._linalg import matmul
 from jaxloc.alignment.lucas_kanade import LucasKanade, Pyramid, align
 from jaxloc.images.interpolation import AbstractInterpolation, Bilinear, sample_components
 from jaxloc.images.warps import Euclidean
 from jaxloc.poses import SE2
-from jaxloc.poses.lie_group import matmul
 from jaxloc.slam.mosaic.raster import Raster
 from jaxloc.slam.mosaic.view import Patch
 from jaxloc.solvers import Estimate

@@ -9,9 +9,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._linalg import matmul
 from jaxloc.images.interpolation import AbstractInterpolation, Bicubic, sample_components
 from jaxloc.images.normalization import as_gray
-from jaxloc.poses.lie_group import matmul
 from jaxloc.sensors.ground_camera import GroundCamera
 from jaxloc.slam.mosaic.raster import Raster
 from jaxloc.solvers.cholesky import factor
