@@ -156,7 +156,3 @@ def _agreeing_measurement(
     moved = matches.previous + matmul(gain, whitened)[..., 0]
     plausible = jnp.sum(whitened[..., 0] ** 2, axis=1) < 25.0
     return jnp.where((plausible & rig.has_depth(moved))[:, None], moved, believed)
-
-
-def matmul(a: Array, b: Array) -> Array:
-    return matmul(a, b)
