@@ -13,16 +13,17 @@ from scipy.spatial import cKDTree
 from skimage import data
 
 from benchmarks.metric import ACCURACY, REPOSITORY, TIME, Metric, quickest, versus
-from jaxloc.features import kaze, opencv, sift, surf
+from jaxloc.features import opencv
+from jaxloc.features.akaze import akaze
 from jaxloc.features.brief import brief, draw_tests, intensity_centroid
 from jaxloc.features.fast import fast
-from jaxloc.features.kaze import Kaze
+from jaxloc.features.kaze import kaze
 from jaxloc.features.keypoints import Descriptors, Keypoints
 from jaxloc.features.match import match
-from jaxloc.features.opencv.describe import describe
 from jaxloc.features.orb import orb
-from jaxloc.features.select import cover_squares, coverage, spread
-from jaxloc.features.surf import laplacian_gate
+from jaxloc.features.select import cover_squares, coverage, select_by_grid
+from jaxloc.features.sift import sift
+from jaxloc.features.surf import laplacian_gate, surf
 
 RECORDINGS = REPOSITORY.parent / "shared" / "data"
 # Slots; a point is found again within so many pixels; ratio of the nearest distance to the next.
@@ -68,7 +69,7 @@ def on_arrays(function: Callable, image: np.ndarray) -> tuple[Keypoints, Descrip
 def on_host(kind: opencv.AbstractDetector, image: np.ndarray) -> tuple[Keypoints, Descriptors]:
     """OpenCV's strongest keypoints, described by the same feature; FAST's by ORB."""
     keypoints = opencv.detect(kind, image, CAPACITY, (1, 1))
-    return keypoints, describe(opencv.ORB() if isinstance(kind, opencv.FAST) else kind, image, keypoints)
+    return keypoints, opencv.describe(opencv.ORB() if isinstance(kind, opencv.FAST) else kind, image, keypoints)
 
 
 @eqx.filter_jit
@@ -85,7 +86,7 @@ def features(smoke: bool) -> dict[str, Feature]:
         "sift": (partial(sift, capacity=CAPACITY), 128 * 32.0),
         "surf": (partial(surf, capacity=CAPACITY), 64 * 32.0),
         "kaze": (partial(kaze, capacity=CAPACITY), 64 * 32.0),
-        "akaze": (partial(kaze, options=Kaze.accelerated(), capacity=CAPACITY), 486.0),
+        "akaze": (partial(akaze, capacity=CAPACITY), 486.0),
         "fast": (fast_with_brief, 256.0),
         "orb": (partial(orb, capacity=CAPACITY), 256.0),
     }
@@ -229,7 +230,7 @@ def _spread(smoke: bool) -> Iterator[Metric]:
     for image in frames(smoke):
         found = fast(jnp.asarray(image, jnp.float32), threshold=10.0, capacity=4000)
         options = {"shape": image.shape, "capacity": 200}
-        turns = spread(found.uv, found.response, found.valid, grid=GRID, **options)
+        turns = select_by_grid(found.uv, found.response, found.valid, grid=GRID, **options)
         squares = cover_squares(found.uv, found.response, found.valid, **options)
         chosen = {"strongest": (found.uv[:200], found.valid[:200])}
         chosen |= {k: (found.uv[s.index], s.valid) for k, s in (("grid", turns), ("squares", squares))}

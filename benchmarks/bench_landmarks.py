@@ -25,7 +25,14 @@ from jaxloc.sensors import (
 )
 from jaxloc.sensors.landmarks import confusion
 from jaxloc.slam.ekf_slam import EkfSlam
-from jaxloc.slam.fast_slam import Appearance, DescriptorFastSlam, FastSlam, FromBlock, FromMotion, FromReading
+from jaxloc.slam.fast_slam import (
+    Appearance,
+    BlockProposal,
+    DescriptorFastSlam,
+    FastSlam,
+    MeasurementProposal,
+    MotionProposal,
+)
 
 _RECORDINGS = Path(__file__).resolve().parents[2] / "shared" / "data"
 _MRCLAM_CLOCK = 1248272272.94  # stamp of time zero of the motion capture, from the recording's notes
@@ -33,9 +40,9 @@ _DELAYS = np.arange(0.0, 0.45, 0.05)  # s, from a command of the robot to its ef
 _DEVIATIONS = (0.1, 0.03)
 _GATE = 0.999
 _PROPOSALS = (
-    ("fast_slam_1", FromMotion()),
-    ("fast_slam_2", FromReading()),
-    ("fast_slam_of_blocks", FromBlock(200)),
+    ("fast_slam_1", MotionProposal()),
+    ("fast_slam_2", MeasurementProposal()),
+    ("fast_slam_of_blocks", BlockProposal(200)),
 )
 _KINDS, _LOOKS = 5, 8  # how many landmarks look different, and numbers of a descriptor
 
@@ -118,7 +125,7 @@ def _nearest(end: Any, world: Any) -> tuple[Any, Any]:
 
 
 def _each(follow: Any, *stacked: Any) -> Any:
-    """One by one, so that what is done now and then (a `FromBlock` draws) costs nothing in between."""
+    """One by one, so that what is done now and then (a `BlockProposal` draws) costs nothing in between."""
     return jax.jit(lambda *items: jax.lax.map(lambda one: follow(*one), items))(*stacked)
 
 

@@ -17,7 +17,7 @@ from benchmarks.metric import ACCURACY, TIME, Metric, compiled, quickest
 from jaxloc.data.simulate.road.drive import Course, RoadDrive, drive
 from jaxloc.data.simulate.road.rendering import Road, Streak, render
 from jaxloc.lanes import ralph
-from jaxloc.lanes.ground_view import GroundGrid, GroundView, look
+from jaxloc.lanes.ground_view import GroundGrid, GroundView, inverse_perspective
 
 PITCH = 0.03
 GROUND = jl.sensors.GroundCamera(jl.sensors.Pinhole(600.0, 600.0, 319.5, 199.5), 1.3, PITCH)
@@ -48,7 +48,7 @@ def metrics(smoke: bool) -> Iterator[Metric]:
 def view_of(picture: np.ndarray, wrong_pitch: float = 0.0) -> GroundView:
     """An image from above, by a camera whose pitch may be known wrongly."""
     ground = eqx.tree_at(lambda g: g.pitch, GROUND, GROUND.pitch - wrong_pitch)
-    return look(ground, jnp.asarray(picture), GroundGrid.for_speed(SPEED))
+    return inverse_perspective(ground, jnp.asarray(picture), GroundGrid.for_speed(SPEED))
 
 
 def template_of(road: Road, pictures: int = 8) -> ralph.Template:
@@ -97,13 +97,13 @@ def _time(repeats: int, batch: int) -> Iterator[Metric]:
     grid = GroundGrid.for_speed(SPEED)
 
     def whole(picture, template):
-        return ralph.estimate(look(GROUND, picture, grid), template)
+        return ralph.estimate(inverse_perspective(GROUND, picture, grid), template)
 
     def narrow(picture, template):
         near = ralph.Hypotheses.around(
             ralph.LaneFit(0.25, 0.012, 8e-4), curvature=6e-4, heading=0.015, pitch=0.006, counts=(9, 7, 3)
         )
-        return ralph.estimate(look(GROUND, picture, grid), template, hypotheses=near)
+        return ralph.estimate(inverse_perspective(GROUND, picture, grid), template, hypotheses=near)
 
     for key, function in (("lanes.frame", whole), ("lanes.frame.predicted", narrow)):
         program, took = compiled(function, picture, template)
@@ -111,7 +111,7 @@ def _time(repeats: int, batch: int) -> Iterator[Metric]:
         yield Metric(f"{key}.compile", took.wall, "s", "lower", TIME)
         yield Metric(key, 1e3 * best.wall, "ms", "lower", TIME)
         yield Metric(f"{key}.cpu", 1e3 * best.cpu, "ms", "lower", TIME)
-    views = jax.vmap(lambda shift: look(GROUND, picture + shift, grid))(jnp.linspace(0.0, 9.0, batch))
+    views = jax.vmap(lambda shift: inverse_perspective(GROUND, picture + shift, grid))(jnp.linspace(0.0, 9.0, batch))
     together = jax.jit(jax.vmap(ralph.estimate, in_axes=(0, None)))
     best = quickest(lambda: together(views, template), 1)
     yield Metric("lanes.batch", 1e3 * best.wall / batch, f"ms a road, {batch} under vmap", "lower", TIME)

@@ -123,7 +123,7 @@ def _update_rate() -> Iterator[Metric]:
     )
     for name, combination in (("plain", update_rate.PlainSum()), ("quadrature", update_rate.Quadrature())):
         found = update_rate.find_minimum(
-            jnp.asarray(way / counts, jnp.float32), combination.combine(drift.spread, drift.offset)
+            jnp.asarray(way / counts, jnp.float32), combination.combine(drift.deviation, drift.offset)
         )
         best = update_rate.best_spacing(sigma=sigma, k=k, way=way, combination=combination)
         yield Metric(f"mosaic.update_rate.{name}", float(found / best), "of formula", "equal", ACCURACY)

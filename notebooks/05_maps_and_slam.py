@@ -124,8 +124,8 @@ def landmark_error(maps):
 
 
 for name, proposal in (
-    ("FastSLAM 1", jl.slam.fast_slam.FromMotion()),
-    ("FastSLAM 2", jl.slam.fast_slam.FromReading()),
+    ("FastSLAM 1", jl.slam.fast_slam.MotionProposal()),
+    ("FastSLAM 2", jl.slam.fast_slam.MeasurementProposal()),
 ):
     fast = jl.slam.FastSlam(motion, *deviations, num_particles=100, capacity=20, proposal=proposal)
 

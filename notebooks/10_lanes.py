@@ -17,7 +17,7 @@ import jaxloc as jl
 from jaxloc.data.simulate.road.drive import Course, drive
 from jaxloc.data.simulate.road.rendering import Road, Streak, render
 from jaxloc.lanes import ralph
-from jaxloc.lanes.ground_view import GroundGrid, look
+from jaxloc.lanes.ground_view import GroundGrid, inverse_perspective
 
 FAST = "JAXLOC_FAST" in os.environ
 plt.rcParams["figure.dpi"] = 70
@@ -35,7 +35,7 @@ pinhole = jl.sensors.Pinhole(600.0 * scale, 600.0 * scale, 319.5 * scale, 199.5 
 ground = jl.sensors.GroundCamera(pinhole, height=1.3, pitch=0.03)
 road, truth = Road(), jl.lanes.Lane(offset=0.3, heading=0.01, curvature=1.5e-3)
 picture = render(road, truth, ground, shape=shape, travelled=100.0)
-view = look(ground, jnp.asarray(picture), GroundGrid.for_speed(20.0))
+view = inverse_perspective(ground, jnp.asarray(picture), GroundGrid.for_speed(20.0))
 straight = ralph.straighten(view, ralph.LaneFit(0.3, 0.01, 1.5e-3), view.grid.left)
 
 figure, axes = plt.subplots(1, 3, figsize=(11, 3))
@@ -68,7 +68,9 @@ plt.show()
 # across the road do not matter. The covariance comes from leaving out stretches of road, and bands of it.
 
 # %%
-saved = look(ground, jnp.asarray(render(road, jl.lanes.Lane(0.0, 0.0, 0.0), ground, shape=shape)), view.grid)
+saved = inverse_perspective(
+    ground, jnp.asarray(render(road, jl.lanes.Lane(0.0, 0.0, 0.0), ground, shape=shape)), view.grid
+)
 template = ralph.capture(saved, ralph.LaneFit())
 state = ralph.estimate(view, template)
 sigma = jnp.sqrt(jnp.diag(state.estimate.covariance))
@@ -92,7 +94,7 @@ print("ok:", bool(state.ok), " confidence:", round(float(state.confidence), 2))
 other = Road(marks=(), streaks=(Streak(1.35, 0.15, 25.0), Streak(-0.2, 0.3, -20.0), Streak(-1.25, 0.2, 20.0)), seed=5)
 frames = 40 if FAST else 70
 trip = drive(road.followed_by(other, 40.0), ground, frames, course=Course(interval=0.1), shape=shape)
-views = [look(ground, jnp.asarray(frame), view.grid) for frame in trip.frames()]
+views = [inverse_perspective(ground, jnp.asarray(frame), view.grid) for frame in trip.frames()]
 for adaptation in (ralph.Fixed(), ralph.Blended(0.1), ralph.Predictive()):
     fit, believed = ralph.LaneFit(*trip.lanes[0, :3]), []
     template = ralph.capture(views[0], fit)

@@ -57,7 +57,7 @@ def test_simulated_drives_are_best_at_the_formulas_optimum(name, simulated):
     combination, (spacing, drift) = COMBINATIONS[name][0], simulated
     best = float(update_rate.best_spacing(sigma=SIGMA, k=K, way=WAY, combination=combination))
     assert 1.5 * spacing[-1] < best < spacing[0] / 1.5
-    found = float(update_rate.find_minimum(spacing, combination.combine(drift.spread, drift.offset)))
+    found = float(update_rate.find_minimum(spacing, combination.combine(drift.deviation, drift.offset)))
     assert found == pytest.approx(best, rel=0.1)
 
 
@@ -65,5 +65,5 @@ def test_dtype_is_kept(dtype):
     drift = update_rate.simulate_drift(
         jnp.array([2.0, 3.0], dtype), sigma=0.1, k=0.1, way=1.0, key=jax.random.key(0), most=3, runs=10
     )
-    assert drift.spread.dtype == dtype and drift.offset.dtype == dtype
+    assert drift.deviation.dtype == dtype and drift.offset.dtype == dtype
     assert update_rate.expected_error(jnp.ones(2, dtype), sigma=1.0, k=1.0, way=1.0).dtype == dtype

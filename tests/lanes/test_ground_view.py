@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxloc as jl
-from jaxloc.lanes.ground_view import GroundGrid, look
+from jaxloc.lanes.ground_view import GroundGrid
 
 SHAPE = (120, 160)
 LENS = jl.sensors.BrownConrady
@@ -29,7 +29,7 @@ def test_view_is_the_warp_of_opencv():
     """Against OpenCV's perspective warp by our homography (itself tested against its projection)."""
     picture = smooth_picture()
     to_pixel = np.array(ground().homography(), np.float64)
-    view = look(ground(), jnp.asarray(picture), GRID)
+    view = inverse_perspective(ground(), jnp.asarray(picture), GRID)
     expected = np.zeros(view.image.shape)
     # Four rays a column, so that narrow marks do not alias.
     for place, weight in ((0.75, 1), (0.25, 3), (-0.25, 3), (-0.75, 1)):
@@ -59,7 +59,7 @@ def test_faster_looks_farther_without_a_new_program():
     @jax.jit
     def view(speed, picture):
         traces.append(None)
-        return look(ground(), picture, GroundGrid.for_speed(speed, rows=8, columns=16)).grid.ahead
+        return inverse_perspective(ground(), picture, GroundGrid.for_speed(speed, rows=8, columns=16)).grid.ahead
 
     slow, fast = (view(jnp.array(speed), jnp.asarray(smooth_picture())) for speed in (5.0, 30.0))
     assert fast[0] > slow[0] and fast[-1] > slow[-1] and len(traces) == 1
@@ -71,7 +71,7 @@ def test_a_wrong_pitch_moves_rows_as_a_whole(x64, roll, lens):
     change = 0.01
     made = ground(0.06, roll, None if lens is None else LENS(jnp.array(lens)))
     grid = GroundGrid.between(4.0, 30.0, 6.0, rows=6, columns=8)
-    view = look(made, jnp.asarray(smooth_picture(), jnp.float64), grid)
+    view = inverse_perspective(made, jnp.asarray(smooth_picture(), jnp.float64), grid)
     ahead, scale = view.true_range(jnp.array(change))
     x, y = jnp.broadcast_to(grid.ahead[:, None], (6, 8)), jnp.broadcast_to(grid.left, (6, 8))
     true = eqx.tree_at(lambda g: g.pitch, made, made.pitch + change)
@@ -82,31 +82,31 @@ def test_a_wrong_pitch_moves_rows_as_a_whole(x64, roll, lens):
 
 def test_what_is_not_in_the_picture_is_not_seen():
     picture = smooth_picture()
-    whole = look(ground(), jnp.asarray(picture), GRID)
+    whole = inverse_perspective(ground(), jnp.asarray(picture), GRID)
     broken = picture.copy()
     broken[72:78, 70:90] = np.nan
-    view = look(ground(), jnp.asarray(broken), GRID)
+    view = inverse_perspective(ground(), jnp.asarray(broken), GRID)
     lost = np.array(whole.seen & ~view.seen)
     assert 0 < lost.sum() < 200 and bool(jnp.all(jnp.isfinite(view.image)))
     kept = np.array(view.seen)
     np.testing.assert_array_equal(np.array(view.image)[kept], np.array(whole.image)[kept])
-    up = look(ground(pitch=-0.9), jnp.asarray(picture), GRID)
+    up = inverse_perspective(ground(pitch=-0.9), jnp.asarray(picture), GRID)
     assert not bool(up.seen.any()) and bool(jnp.all(up.image == 0.0))
-    lost = look(ground(pitch=np.nan), jnp.asarray(picture), GRID)
+    lost = inverse_perspective(ground(pitch=np.nan), jnp.asarray(picture), GRID)
     assert not bool(lost.seen.any()) and bool(jnp.all(jnp.isfinite(lost.image)))
 
 
 def test_bytes_are_taken_and_shapes_are_checked():
     levels = np.clip(smooth_picture(), 0, 255).astype(np.uint8)
-    view = look(ground(), jnp.asarray(levels), GRID)
-    same = look(ground(), jnp.asarray(levels, jnp.float32), GRID)
+    view = inverse_perspective(ground(), jnp.asarray(levels), GRID)
+    same = inverse_perspective(ground(), jnp.asarray(levels, jnp.float32), GRID)
     np.testing.assert_allclose(view.image, same.image, rtol=1e-5)
     with pytest.raises(ValueError, match="at least 2 and 4"):
         GroundGrid.between(5.0, 20.0, 6.0, rows=1, columns=8)
 
 
 def test_coarser_views_keep_smooth_pictures_and_places():
-    view = look(ground(), jnp.asarray(smooth_picture()), GRID)
+    view = inverse_perspective(ground(), jnp.asarray(smooth_picture()), GRID)
     half = view.coarser()
     assert half.image.shape == (12, 24)
     np.testing.assert_allclose(half.grid.left, 0.5 * (GRID.left[::2] + GRID.left[1::2]), atol=1e-5)
@@ -123,7 +123,7 @@ def test_gradients_by_picture_and_pitch(x64):
 
     def total(picture, pitch):
         made = eqx.tree_at(lambda g: g.pitch, ground(), pitch)
-        return jnp.sum(weights * look(made, picture, grid).image)
+        return jnp.sum(weights * inverse_perspective(made, picture, grid).image)
 
     pitch = jnp.array(0.06)
     by_picture, by_pitch = jax.grad(total, argnums=(0, 1))(picture, pitch)
@@ -135,7 +135,7 @@ def test_gradients_by_picture_and_pitch(x64):
 
 
 def test_dtype_is_kept(dtype):
-    view = look(
+    view = inverse_perspective(
         ground(dtype=dtype), jnp.asarray(smooth_picture(), dtype), jax.tree.map(lambda g: g.astype(dtype), GRID)
     )
     assert view.image.dtype == view.height.dtype == dtype

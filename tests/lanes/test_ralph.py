@@ -10,7 +10,7 @@ import pytest
 import jaxloc as jl
 from jaxloc.data.simulate.road.rendering import Road, Streak, render
 from jaxloc.lanes import ralph
-from jaxloc.lanes.ground_view import GroundGrid, GroundView, look
+from jaxloc.lanes.ground_view import GroundGrid, GroundView, inverse_perspective
 
 SHAPE = (240, 320)
 GROUND = jl.sensors.GroundCamera(jl.sensors.Pinhole(300.0, 300.0, 159.5, 99.5), 1.3, 0.03)
@@ -26,7 +26,7 @@ FOREIGN = Road(
 
 def view_of(picture, wrong_pitch=0.0, grid=None):
     made = eqx.tree_at(lambda g: g.pitch, GROUND, GROUND.pitch - wrong_pitch)
-    return look(made, jnp.asarray(picture), GroundGrid.for_speed(15.0) if grid is None else grid)
+    return inverse_perspective(made, jnp.asarray(picture), GroundGrid.for_speed(15.0) if grid is None else grid)
 
 
 def picture_of(road, truth, **options):
@@ -208,7 +208,7 @@ def test_gradient_by_picture_and_pitch(x64, template):
 
     def lane(change_and_pitch):
         amount, pitch = change_and_pitch
-        view = look(eqx.tree_at(lambda g: g.pitch, made, pitch), picture + amount * change, grid)
+        view = inverse_perspective(eqx.tree_at(lambda g: g.pitch, made, pitch), picture + amount * change, grid)
         kernels = (jl.solvers.Huber(20.0), jl.solvers.Quadratic(), jl.solvers.Quadratic())
         problem = ralph.TemplateResidual(view, wide, jnp.array(0.5), jnp.array(0.01), kernels)
         found = jl.solvers.solve(problem, start, solver=exact)
@@ -236,7 +236,7 @@ def test_what_shows_no_road_is_not_believed(template, kind):
     made = eqx.tree_at(lambda g: g.pitch, GROUND, jnp.array(-1.0)) if kind == "unseen" else GROUND
 
     def offset(picture):
-        state = ralph.estimate(look(made, picture, GroundGrid.for_speed(15.0)), template)
+        state = ralph.estimate(inverse_perspective(made, picture, GroundGrid.for_speed(15.0)), template)
         return state.offset, state
 
     slope, state = jax.grad(offset, has_aux=True)(jnp.asarray(picture))

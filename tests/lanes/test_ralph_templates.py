@@ -11,7 +11,7 @@ import jaxloc as jl
 from jaxloc.data.simulate.road.drive import Course, drive
 from jaxloc.data.simulate.road.rendering import Road, Streak
 from jaxloc.lanes import ralph
-from jaxloc.lanes.ground_view import GroundGrid, look
+from jaxloc.lanes.ground_view import GroundGrid
 
 pytestmark = pytest.mark.heavy
 
@@ -55,7 +55,7 @@ def test_templates_follow_a_road_that_changes():
     """K-42 to K-44: another surface comes from ahead; a fixed template is lost, others keep the lane to some dm."""
     road = dataclasses.replace(ROAD, shadows=None).followed_by(dataclasses.replace(FOREIGN, shadows=None), 40.0)
     trip = drive(road, GROUND, 60, course=Course(speed=20.0, interval=0.1), shape=SHAPE)
-    views = [look(GROUND, jnp.asarray(picture), GroundGrid.for_speed(15.0)) for picture in trip.frames()]
+    views = [inverse_perspective(GROUND, jnp.asarray(picture), GroundGrid.for_speed(15.0)) for picture in trip.frames()]
     kinds = (ralph.Fixed(), ralph.Blended(0.1), ralph.Predictive())
     fixed, blended, predictive = (follow(trip, views, kind) for kind in kinds)
     assert not fixed[1][-10:].any()

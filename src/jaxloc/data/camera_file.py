@@ -1,4 +1,4 @@
-"""Cameras in files of OpenCV: the YAML that its calibration programs write, with what a ground robot adds.
+"""Camera files in OpenCV's YAML format, with height and mounting angles of a ground robot.
 
 ::
 
@@ -40,7 +40,7 @@ _LENS_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 class CameraFile(eqx.Module):
-    """What a file says of a camera.
+    """Contents of a camera file.
 
     Attributes:
         camera: focal lengths, principal point and lens.

@@ -1,4 +1,4 @@
-"""Laser logs in CARMEN's text format: one message a line, plain or compressed with gzip or bzip2.
+"""CARMEN laser logs: one message per line, plain or compressed with gzip or bzip2.
 
 ::
 
@@ -98,7 +98,7 @@ def _make_log(path: Path, rows: list[dict[str, Any]], limit: float | None) -> La
 
 
 def increasing(path: Path, times: np.ndarray) -> np.ndarray:
-    """Which scans are later than all that were kept before them.
+    """Mask of scans that are later than all scans kept before them.
 
     Args:
         path: the file, for the error.

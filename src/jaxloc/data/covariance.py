@@ -1,4 +1,4 @@
-"""Pose covariances, one a row: ``frame`` and the 36 numbers of the 6x6 matrix.
+"""Pose covariances as CSV rows: ``frame`` and the 36 numbers of the 6x6 matrix.
 
 The tangent is the right perturbation ``T exp(d)`` with ``d = (tx, ty, tz, rx, ry, rz)``: translation first, in the
 camera frame, m and rad. The two header lines say so.

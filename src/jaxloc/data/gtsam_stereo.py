@@ -1,4 +1,4 @@
-"""Bundles on disk: the text files of stereo factors that come with GTSAM.
+"""Stereo bundles in GTSAM's text format of stereo factors.
 
 ::
 
@@ -30,7 +30,7 @@ _LARGEST = 256 * 2**20
 
 
 class StereoBundle(eqx.Module):
-    """Points seen by a stereo rig from many places.
+    """Stereo observations of points from many poses.
 
     Attributes:
         rig: the rig.

@@ -1,4 +1,4 @@
-"""Stereo sequences in the layout of the KITTI odometry benchmark: images, calibration, stamps and true poses.
+"""KITTI odometry sequences: images, calibration, time stamps and true poses.
 
 ::
 
@@ -27,7 +27,7 @@ from jaxloc.sensors import Pinhole, StereoRig
 
 
 class KittiSequence(eqx.Module):
-    """A stereo recording on disk; frames are read when they are asked for. Made by :func:`read_sequence`."""
+    """A stereo recording on disk; frames are read on demand. Made by :func:`read_sequence`."""
 
     name: str
     rig: StereoRig

@@ -1,4 +1,4 @@
-"""What every reader and simulator of planar laser logs gives: stamped scans with the odometry at each, on the host."""
+"""Planar laser log: time-stamped scans with odometry, as host arrays."""
 
 import equinox as eqx
 import numpy as np

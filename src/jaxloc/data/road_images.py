@@ -1,6 +1,6 @@
-"""Images of the road ahead: a single one, a folder of them, or a video; frame by frame.
+"""Road images from a file, a folder or a video, frame by frame.
 
-Host code: a frame is decoded when it is asked for.
+Host code: frames are decoded on demand.
 """
 
 import os
@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from jaxloc.data.io.errors import DataError
-from jaxloc.features.opencv.library import load
+from jaxloc.features.opencv.backend import load
 
-_PICTURES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
+_IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 _VIDEOS = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv"})
 
 
@@ -50,7 +50,7 @@ class LaneRecording(eqx.Module):
         files: the images, or the one video.
         rate: frames a second of a video; None for images.
         shape: rows and columns.
-        count: frames; what a video says of itself, which may be more than can be decoded.
+        count: frames; as declared by a video, which may be more than can be decoded.
     """
 
     path: Path
@@ -70,10 +70,10 @@ class LaneRecording(eqx.Module):
     def __iter__(self) -> Iterator[LaneFrame]:
         if self.rate is not None:
             return self._video_frames(self.rate)
-        return (self._picture_frame(index, path) for index, path in enumerate(self.files))
+        return (self._image_frame(index, path) for index, path in enumerate(self.files))
 
-    def _picture_frame(self, index: int, path: Path) -> LaneFrame:
-        color = _read_picture(path)
+    def _image_frame(self, index: int, path: Path) -> LaneFrame:
+        color = _read_image(path)
         if color.shape[:2] != self.shape:
             raise DataError(path, f"is {_size(color.shape)}, but the first image is {_size(self.shape)}")
         return LaneFrame(index, path.name, None, _gray(color), color)
@@ -92,7 +92,7 @@ class LaneRecording(eqx.Module):
 
 
 def open_recording(path: Path | str) -> LaneRecording:
-    """Opens images of the road; the first one is decoded to see that it can be.
+    """Opens road images; the first one is decoded as a check.
 
     Args:
         path: an image, a video, or a folder of images (in the natural order of their names: 9 before 10).
@@ -117,15 +117,15 @@ def open_recording(path: Path | str) -> LaneRecording:
         raise DataError(path, "no such file or folder")
     if path.is_file() and path.suffix.lower() in _VIDEOS:
         return _probe_video(path)
-    files = _pictures(path) if path.is_dir() else (path,)
+    files = _image_files(path) if path.is_dir() else (path,)
     if not files:
         raise DataError(path, "has no images: png, jpg, bmp, tif, pgm, ppm and webp are read")
-    shape = _read_picture(files[0]).shape[:2]
+    shape = _read_image(files[0]).shape[:2]
     return LaneRecording(path, files, None, shape, len(files))
 
 
-def _pictures(folder: Path) -> tuple[Path, ...]:
-    found = [path for path in folder.iterdir() if path.suffix.lower() in _PICTURES and path.is_file()]
+def _image_files(folder: Path) -> tuple[Path, ...]:
+    found = [path for path in folder.iterdir() if path.suffix.lower() in _IMAGES and path.is_file()]
     return tuple(sorted(found, key=lambda path: _natural(path.name)))
 
 
@@ -135,7 +135,7 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
 
 
-def _read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     cv2 = load()
     try:
         data = np.fromfile(path, np.uint8)

@@ -1,4 +1,4 @@
-"""Occupancy maps in the format of the ROS map server: a YAML file with the scale, and an image.
+"""ROS map server files: a YAML file with resolution and origin, and an image.
 
 ::
 

@@ -1,6 +1,6 @@
-"""What every reader and simulator of stereo images gives: a rig, stamped image pairs and, where known, the true path.
+"""Stereo sequence interface: a rig, time-stamped image pairs and, where known, the true path.
 
-Host code: images are NumPy arrays, read when they are asked for.
+Host code: images are NumPy arrays, read on demand.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ class StereoFrame(eqx.Module):
 
 @runtime_checkable
 class StereoSequence(Protocol):
-    """A stereo recording, real or simulated, whose frames are made when they are asked for.
+    """Stereo recording, real or simulated, with frames loaded on demand.
 
     ``truth`` holds the true poses ``T_world_camera`` of the left camera, one a frame, where they are known.
     """

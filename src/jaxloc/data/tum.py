@@ -1,4 +1,4 @@
-"""Trajectories in the format of the TUM RGB-D benchmark: ``time x y z qx qy qz qw``, one pose a line."""
+"""TUM trajectory files: ``time x y z qx qy qz qw``, one pose per line."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from jaxloc.poses import Trajectory
 
 
 class StampedTrajectory(eqx.Module):
-    """A path and the stamp from which its times count, which a 32-bit number could not hold.
+    """Trajectory with its first time stamp in float64, relative to which its times count.
 
     Args:
         start: the stamp of time zero, s (a host number in double precision).

@@ -1,4 +1,4 @@
-"""Maps and logs in the text formats of a well-known particle-filter exercise (CMU Wean Hall), in centimeters.
+"""CMU Wean Hall maps and laser logs, text formats of a well-known particle filter exercise.
 
 ::
 

@@ -1,4 +1,4 @@
-"""Whether an estimator knows how wrong it is: errors measured in its own sigmas, against the chi-square distribution.
+"""Consistency of covariances: NEES, NIS and coverage, against the chi-square distribution.
 
 References:
     Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, section 5.4.
@@ -38,7 +38,7 @@ class Interval(eqx.Module):
 
 
 class Calibration(eqx.Module):
-    """Squared errors beside the chi-square distribution that they should have.
+    """Distribution of squared errors compared with chi-square.
 
     Attributes:
         edges: of the histogram's bins.
@@ -129,7 +129,7 @@ def trajectory_nees(estimate: Trajectory, covariances: Float[Array, "n d d"], tr
 
 @eqx.filter_jit
 def mean_bounds(degrees_of_freedom: int, num_values: int, *, confidence: float | Float[Array, ""] = 0.95) -> Interval:
-    """Where the mean of independent NEES or NIS values lies when the estimator is consistent.
+    """Confidence interval of the mean of independent NEES or NIS values of a consistent estimator.
 
     Args:
         degrees_of_freedom: of one value.
@@ -156,7 +156,7 @@ def mean_bounds(degrees_of_freedom: int, num_values: int, *, confidence: float |
 def coverage(
     squared: SquaredErrors, degrees_of_freedom: int, *, probabilities: tuple[float, ...] = (0.5, 0.9, 0.95)
 ) -> Float[Array, " k"]:
-    """The fraction of truths that lie in the estimator's own confidence ellipsoids.
+    """Fraction of true values inside the estimator's confidence ellipsoids.
 
     Args:
         squared: NEES values.
@@ -185,7 +185,7 @@ def calibration(
     num_bins: int = 20,
     probabilities: tuple[float, ...] = (0.5, 0.9, 0.95),
 ) -> Calibration:
-    """How the squared errors of an estimator are distributed, against chi-square.
+    """Calibration of squared errors: their distribution against chi-square.
 
     Args:
         squared: NEES values, such as those of positions: ``jax.vmap(nees)(errors, covariances)``.

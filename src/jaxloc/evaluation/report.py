@@ -1,4 +1,4 @@
-"""Reports: one HTML page that holds everything, to be opened anywhere and sent to anyone."""
+"""HTML reports: one self-contained page."""
 
 import base64
 import io
@@ -42,7 +42,7 @@ class Section(eqx.Module):
 
 
 class Highlight(eqx.Module):
-    """A number that a reader looks for first.
+    """Key figure at the top of a report.
 
     Args:
         label: what it is.

@@ -1,12 +1,12 @@
-"""How often to register images to each other: random error rewards seldom, systematic error rewards often.
+"""Optimal update rate of image registration: random against systematic error.
 
 Over a way L with an update every d there are L / d updates. Each brings a random error of standard deviation sigma,
 independent of the others: together ``sqrt(sigma^2 L / d)``. Each also brings a systematic error, and if that grows with
 the *square* of the displacement, ``k d^2`` (images that overlap less and lie further from the middle of the lens),
 the errors add up to ``(L / d) k d^2 = k L d``. (Were it proportional to d, the sum would not depend on d at all.)
 
-Kelly's curve is the *plain sum* of both, a spread beside an offset; the root mean square over many drives is their sum
-in *quadrature*, whose minimum lies at a spacing greater by the cube root of two.
+Kelly's curve is the *plain sum* of both, a standard deviation beside an offset; the root mean square over many drives
+is their sum in *quadrature*, whose minimum lies at a spacing greater by the cube root of two.
 """
 
 from abc import abstractmethod
@@ -21,10 +21,10 @@ from jaxloc.poses.lie_group import as_floats
 
 
 class Combination(eqx.Module):
-    """How a random and a systematic error make one number."""
+    """Combination of random and systematic error (strategy)."""
 
     @abstractmethod
-    def combine(self, spread: Float[Array, "*n"], offset: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    def combine(self, deviation: Float[Array, "*n"], offset: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """The number."""
 
     @abstractmethod
@@ -35,9 +35,9 @@ class Combination(eqx.Module):
 class PlainSum(Combination):
     """One standard deviation beside the offset: ``E = sqrt(sigma^2 L / d) + k L d`` [K-82]."""
 
-    def combine(self, spread: Float[Array, "*n"], offset: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    def combine(self, deviation: Float[Array, "*n"], offset: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """The sum."""
-        return spread + jnp.abs(offset)
+        return deviation + jnp.abs(offset)
 
     def best_spacing(self, sigma: Any, k: Any, way: Any) -> Float[Array, ""]:
         """``(sigma / (2 k sqrt(L)))^(2/3)``: where ``-sigma sqrt(L) / (2 d^(3/2)) + k L = 0``."""
@@ -48,9 +48,9 @@ class PlainSum(Combination):
 class Quadrature(Combination):
     """The root mean square over many drives: ``E^2 = sigma^2 L / d + (k L d)^2``."""
 
-    def combine(self, spread: Float[Array, "*n"], offset: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    def combine(self, deviation: Float[Array, "*n"], offset: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """The root of the sum of squares."""
-        return jnp.sqrt(spread**2 + offset**2)
+        return jnp.sqrt(deviation**2 + offset**2)
 
     def best_spacing(self, sigma: Any, k: Any, way: Any) -> Float[Array, ""]:
         """``(sigma^2 / (2 k^2 L))^(1/3)``."""
@@ -62,7 +62,7 @@ class Quadrature(Combination):
 def expected_error(
     spacing: Float[Array, "*n"], *, sigma: Any, k: Any, way: Any, combination: Combination = PlainSum()
 ) -> Float[Array, "*n"]:
-    """Error at the end of a way with an update at every spacing.
+    """Expected error at the end of a path for an update spacing.
 
     Args:
         spacing: d, m.
@@ -110,14 +110,14 @@ def best_spacing(*, sigma: Any, k: Any, way: Any, combination: Combination = Pla
 
 
 class Drift(eqx.Module):
-    """What simulated drives end with.
+    """Errors at the end of simulated drives.
 
     Attributes:
-        spread: standard deviation of the error over the drives, m.
+        deviation: standard deviation of the error over the drives, m.
         offset: mean of the error, m.
     """
 
-    spread: Float[Array, "*n"]
+    deviation: Float[Array, "*n"]
     offset: Float[Array, "*n"]
 
 
@@ -132,7 +132,7 @@ def simulate_drift(
     most: int,
     runs: int = 2000,
 ) -> Drift:
-    """Drives a way many times, update by update, and sees where it ends: knows nothing of the formula.
+    """Monte Carlo simulation of the error at the end of a path with periodic updates.
 
     Each update measures its displacement with a normal error and with a bias of k times the displacement squared; the
     measured displacements are added up.
@@ -147,7 +147,7 @@ def simulate_drift(
         runs: number of drives; static.
 
     Returns:
-        Spread and offset for each count.
+        Standard deviation and offset for each count.
 
     References:
         [K-82].
@@ -155,7 +155,7 @@ def simulate_drift(
     Example:
         >>> import jax, jax.numpy as jnp
         >>> drift = simulate_drift(jnp.array([25.0]), sigma=0.01, k=0.002, way=25.0, key=jax.random.key(0), most=25)
-        >>> round(float(drift.offset[0]), 2), round(float(drift.spread[0]), 2)
+        >>> round(float(drift.offset[0]), 2), round(float(drift.deviation[0]), 2)
         (0.05, 0.05)
     """
     sigma, k, way = (jnp.asarray(value, counts.dtype) for value in (sigma, k, way))
@@ -177,7 +177,7 @@ def simulate_drift(
 
 @eqx.filter_jit
 def find_minimum(spacing: Float[Array, " n"], error: Float[Array, " n"]) -> Float[Array, ""]:
-    """Where a noisy curve of errors is least: at the bottom of a cubic through the logarithms of both.
+    """Minimum of a noisy error curve, by a cubic fit of the logarithms.
 
     Args:
         spacing: abscissas, positive, five or more, the minimum among them.

@@ -1,4 +1,4 @@
-"""Lane departure warning: how long until a wheel is on a line."""
+"""Lane departure warning: the time until a wheel crosses a lane border."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from jaxloc.poses.lie_group import as_floats
 
 
 class LineCrossing(eqx.Module):
-    """When a vehicle leaves its lane, if it goes on straight ahead.
+    """Time to line crossing of a vehicle that does not steer.
 
     Attributes:
         time: s; infinite if it does not, zero if it is on a line already.
@@ -28,17 +28,17 @@ class LineCrossing(eqx.Module):
 def time_to_line_crossing(
     lane: Lane, lane_width: Any = 3.6, vehicle_width: Any = 1.8, speed: Any = 20.0, *, horizon: Any = 200.0
 ) -> LineCrossing:
-    """Time until one side of a vehicle that does not steer is on a border of its lane [K-30].
+    """Time until one side of a vehicle that does not steer reaches a border of its lane [K-30].
 
     Against the lane, a vehicle that goes straight moves by ``n(x) = offset + tan(heading) x - curvature x^2 / 2``; the
     first positive root of ``n(x) = +-(lane - vehicle) / 2`` over its speed is the time. The change of curvature is left
-    out: it matters for those who look far ahead, not for alarms.
+    out: it matters for long horizons, not for warnings.
 
     Args:
         lane: where the vehicle is.
         lane_width: m.
         vehicle_width: m.
-        speed: m/s; at rest nothing is crossed.
+        speed: m/s; at rest no border is crossed.
         horizon: crossings farther ahead are none, m.
 
     Returns:

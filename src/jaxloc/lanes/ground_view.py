@@ -1,4 +1,4 @@
-"""The road from above: an image sampled on a grid of the ground, of equal width at every range."""
+"""Inverse perspective mapping: the image resampled on a grid of the ground plane."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ _NEAREST_RANGE = 1e-2  # m
 
 
 class GroundGrid(eqx.Module):
-    """Where the ground is looked at: rows from near to far, columns from left to right.
+    """Sampling grid on the ground: rows from near to far, columns from left to right.
 
     Args:
         ahead: "rows", ranges of the rows, m, increasing.
@@ -52,9 +52,9 @@ class GroundGrid(eqx.Module):
 
     @staticmethod
     def for_speed(speed: Any, *, width: Any = 9.6, rows: int = 64, columns: int = 128) -> "GroundGrid":
-        """The stretch of road that matters at a speed: from 5 m + 0.1 s of driving to 20 m + 2 s [K-34].
+        """Grid over the range that matters at a speed: from 5 m + 0.1 s of driving to 20 m + 2 s [K-34].
 
-        Speeds are numbers, not shapes: a new one compiles nothing.
+        Speeds are traced numbers: a new one does not recompile.
 
         Args:
             speed: of the vehicle, m/s.
@@ -80,13 +80,13 @@ class GroundGrid(eqx.Module):
 
 
 class GroundView(eqx.Module):
-    """An image of the ground from above.
+    """Bird's-eye view of the ground.
 
     Attributes:
-        image: gray levels, row by range and column by lateral position; zero where nothing is seen.
+        image: gray levels, row by range and column by lateral position; zero where not visible.
         seen: where the ground is in the image.
         grid: where the samples lie.
-        height: of the camera, m: it says how the ranges change with the pitch.
+        height: of the camera, m: needed for the change of ranges with the pitch.
     """
 
     image: Float[Array, "rows columns"]
@@ -136,8 +136,8 @@ def halve_columns(
 
 
 @eqx.filter_jit
-def look(ground: GroundCamera, image: Num[Array, "h w"], grid: GroundGrid) -> GroundView:
-    """Inverse perspective mapping: samples an image where it shows the points of a grid on the ground.
+def inverse_perspective(ground: GroundCamera, image: Num[Array, "h w"], grid: GroundGrid) -> GroundView:
+    """Inverse perspective mapping: samples an image at the projections of the points of a ground grid.
 
     Args:
         ground: camera and its place over the road.
@@ -156,7 +156,7 @@ def look(ground: GroundCamera, image: Num[Array, "h w"], grid: GroundGrid) -> Gr
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> ground = jl.sensors.GroundCamera(jl.sensors.Pinhole(500.0, 500.0, 320.0, 240.0), height=1.5)
         >>> grid = jl.lanes.ground_view.GroundGrid.for_speed(20.0)
-        >>> view = jl.lanes.ground_view.look(ground, jnp.full((480, 640), 7.0), grid)
+        >>> view = jl.lanes.ground_view.inverse_perspective(ground, jnp.full((480, 640), 7.0), grid)
         >>> view.image.shape, bool(jnp.all(view.image[view.seen] == 7.0))
         ((64, 128), True)
     """

@@ -1,4 +1,4 @@
-"""The lane as a vehicle sees it: where its center runs over the ground ahead."""
+"""Lane geometry relative to the vehicle: a clothoid center line on the ground ahead."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from jaxloc.poses.lie_group import as_floats
 
 
 class Lane(eqx.Module):
-    """A lane in the road frame of a vehicle (x forward, y left): a clothoid, seen from beside its center.
+    """Clothoid lane in the road frame of a vehicle (x forward, y left).
 
     The center runs through ``y(x) = -offset - tan(heading) x + curvature x^2 / 2 + rate x^3 / 6``: the Taylor series of
     a clothoid whose direction changes little within view, as on every road one may drive fast on.
@@ -50,11 +50,11 @@ class Lane(eqx.Module):
         return jnp.arctan(x * (self.curvature + 0.5 * x * self.rate) - jnp.tan(self.heading))
 
     def lateral(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """How far points of the ground are left of the lane's center, measured along the vehicle's y axis, m."""
+        """Lateral distance of ground points to the left of the lane's center, along the vehicle's y axis, m."""
         return y - self.center(x)
 
     def advance(self, distance: Float[Array, ""], turn: Float[Array, ""]) -> "Lane":
-        """The same lane after the vehicle has driven on.
+        """The same lane in the vehicle frame after a motion of the vehicle.
 
         Args:
             distance: along its path, m.

@@ -1,4 +1,4 @@
-"""Points that move alike and lie together are one object: its place and velocity, with covariance."""
+"""Clustering of moving points into objects, with position, velocity and covariance."""
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ from jaxloc.odometry.scene_flow import MovingPoints
 
 
 class GroupOptions(eqx.Module):
-    """What counts as one object.
+    """Options of the clustering.
 
     Attributes:
         capacity: objects of a frame, at most.
@@ -35,7 +35,7 @@ class GroupOptions(eqx.Module):
 
 
 class MovingObjects(eqx.Module):
-    """Objects seen moving, in the camera's frame.
+    """Moving objects of one frame, in camera coordinates.
 
     Attributes:
         positions: "k 3" weighted mean of the points, m.
@@ -58,7 +58,7 @@ class MovingObjects(eqx.Module):
 
 @eqx.filter_jit
 def group_points(points: MovingPoints, *, options: GroupOptions = GroupOptions()) -> MovingObjects:
-    """Connected sets of points that are near each other and equally fast.
+    """Clusters moving points: connected components of points that are close in position and velocity.
 
     Args:
         points: those of one frame that move.
@@ -112,12 +112,12 @@ def _connect(alike: Bool[Array, "n n"], valid: Bool[Array, " n"]) -> Int[Array, 
     """The smallest index that each point is connected with."""
     own = jnp.where(valid, jnp.arange(valid.shape[0]), valid.shape[0])
 
-    def spread(state):
+    def propagate(state):
         labels, _ = state
         new = jnp.minimum(labels, jnp.min(jnp.where(alike, labels[None, :], labels.shape[0]), axis=1))
         return new, jnp.any(new != labels)
 
-    return lax.while_loop(lambda state: state[1], spread, (own, jnp.array(True)))[0]
+    return lax.while_loop(lambda state: state[1], propagate, (own, jnp.array(True)))[0]
 
 
 def _mean(
@@ -127,10 +127,10 @@ def _mean(
     weights = member / jnp.trace(covariances, axis1=1, axis2=2)[None, :]
     total = jnp.sum(weights, axis=1, keepdims=True)
     weights = weights / jnp.where(total > 0.0, total, 1.0)
-    spread = jnp.einsum("kn,nij->kij", weights**2, covariances, precision="highest")
+    covariance = jnp.einsum("kn,nij->kij", weights**2, covariances, precision="highest")
     empty = (total[:, 0] <= 0.0)[:, None, None]
     return jnp.einsum("kn,ni->ki", weights, values, precision="highest"), jnp.where(
-        empty, jnp.eye(3, dtype=values.dtype)[None], spread
+        empty, jnp.eye(3, dtype=values.dtype)[None], covariance
     )
 
 

@@ -1,4 +1,4 @@
-"""Points that move by themselves: where a stereo rig saw them in two frames, and how fast they went.
+"""Scene flow of moving points: positions and velocities from two stereo frames with known camera motion.
 
 What the motion of the camera explains is taken out first; only the rest is matched again, by small patches in a window
 that is wide enough for oncoming cars, so that the cost is that of what moves and not of what stands.
@@ -22,22 +22,22 @@ from jaxloc.refinement import StereoMatches
 from jaxloc.sensors import StereoRig
 
 _STILL_CORRELATION = 0.5  # of a patch with one that stands where it would
-_AS_ALIKE = 0.1  # difference of correlations that says nothing
+_AS_ALIKE = 0.1  # insignificant difference of correlations
 
 
 class FlowOptions(eqx.Module):
-    """What counts as a point that moves.
+    """Options of the test for moving points.
 
     Attributes:
-        capacity: points of a frame that nothing explains, at most.
+        capacity: largest number of unexplained points of a frame.
         patch: rows and columns of the patches that are compared, px.
         reach: columns and rows by which a point may move beside what the camera's motion makes it move, px.
         correlation: least correlation of two patches of one point.
         beside: a point is explained by a match this near, px.
         sigma: standard deviation of a keypoint that is not refined, px.
-        farthest: depth beyond which velocities mean nothing, m.
+        farthest: largest depth of points with a usable velocity, m.
         slowest: speed below which a point is taken to stand, m/s.
-        fastest: speed that nothing exceeds, m/s.
+        fastest: largest plausible speed, m/s.
         probability: of a standing point to pass for one; whole objects are tested more strictly later.
     """
 
@@ -54,7 +54,7 @@ class FlowOptions(eqx.Module):
 
 
 class MovingPoints(eqx.Module):
-    """Points that move against the ground, seen from the current left camera.
+    """Points that move relative to the world, in coordinates of the current left camera.
 
     Attributes:
         positions: "n 3", m, camera frame.
@@ -77,7 +77,7 @@ class _Points(eqx.Module):
     """Some features of a frame."""
 
     measured: Float[Array, "n 3"]
-    belief: Gaussian
+    position: Gaussian
     patches: Float[Array, "n p"]
     valid: Bool[Array, " n"]
 
@@ -93,7 +93,7 @@ def find_moving(
     *,
     options: FlowOptions = FlowOptions(),
 ) -> MovingPoints:
-    """Points of two frames that the motion of the camera does not explain.
+    """Finds matched points that the camera motion does not explain.
 
     A point moves if its displacement is larger than its covariance allows: that of both triangulations and of the
     camera's motion. A point that has a partner where it would be if it stood still is taken to stand.
@@ -131,14 +131,14 @@ def find_moving(
     mutual = back[partner] == jnp.arange(score.shape[0])
     found = mutual & (jnp.max(score, axis=1) > 0.0)
     seen = jax.tree.map(lambda leaf: leaf[partner], after)
-    flow = seen.belief.mean - expected
-    covariance = seen.belief.covariance + expected_covariance
+    flow = seen.position.mean - expected
+    covariance = seen.position.covariance + expected_covariance
     squared = jax.vmap(lambda f, c: jnp.sum(whiten(cholesky(c), f) ** 2))(flow, covariance)
     moves = ~gate(squared, 3, options.probability) & (jnp.sum(flow**2, axis=1) > (options.slowest * dt) ** 2)
     return MovingPoints(
-        seen.belief.mean,
+        seen.position.mean,
         flow / dt,
-        seen.belief.covariance,
+        seen.position.covariance,
         covariance / dt**2,
         seen.measured[:, jnp.array([0, 2])],
         found & moves,
@@ -165,8 +165,8 @@ def _unexplained(
     norm = jnp.sqrt(jnp.sum(values**2, axis=1, keepdims=True))
     values = values / jnp.maximum(norm, 1e-3)
     valid = valid & patches.inside & (norm[:, 0] > 1.0)
-    belief = jax.vmap(lambda z, v: triangulate(rig, z, _noise(v, options.sigma)))(measured, variance)
-    return _Points(measured, belief, values, valid)
+    position = jax.vmap(lambda z, v: triangulate(rig, z, _noise(v, options.sigma)))(measured, variance)
+    return _Points(measured, position, values, valid)
 
 
 def _noise(variance: Float[Array, ""], sigma: float) -> Float[Array, "3 3"]:
@@ -180,9 +180,9 @@ def _noise(variance: Float[Array, ""], sigma: float) -> Float[Array, "3 3"]:
 def _carry(points: _Points, pose: Gaussian) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"]]:
     """Where standing points of the previous frame are in the current one, and how surely."""
     back: SE3 = pose.mean.inverse()
-    places = back.apply(points.belief.mean)
+    places = back.apply(points.position.mean)
     rotation = back.rotation.matrix()
-    turned = matmul(matmul(rotation, points.belief.covariance), rotation.T)
+    turned = matmul(matmul(rotation, points.position.covariance), rotation.T)
 
     # T^-1 exp(-d) p: the place moves by -d_t - d_r x p = -d_t + p x d_r.
     def slip(place):
@@ -217,8 +217,10 @@ def _within(
     places = rig.project(jnp.where(in_front[:, None], expected, jnp.array([0.0, 0.0, 10.0])[None, :]))
     columns = jnp.abs(places[:, 0][:, None] - after.measured[None, :, 0])
     rows = jnp.abs(places[:, 2][:, None] - after.measured[None, :, 2])
-    deep = jnp.sqrt(before.belief.covariance[:, 2, 2])[:, None] + jnp.sqrt(after.belief.covariance[:, 2, 2])[None, :]
-    apart = jnp.abs(expected[:, None, :] - after.belief.mean[None, :, :])
+    deep = (
+        jnp.sqrt(before.position.covariance[:, 2, 2])[:, None] + jnp.sqrt(after.position.covariance[:, 2, 2])[None, :]
+    )
+    apart = jnp.abs(expected[:, None, :] - after.position.mean[None, :, :])
     limit = options.fastest * dt
     reachable = (apart[..., 0] < limit) & (apart[..., 1] < 0.1 * limit + 0.5) & (apart[..., 2] < limit + 3.0 * deep)
     return reachable & (columns < options.reach[0]) & (rows < options.reach[1]) & in_front[:, None]

@@ -1,4 +1,4 @@
-"""The front end of stereo odometry: from keypoints of two cameras and two moments to measurements with covariance."""
+"""Front end of stereo odometry: matching between left and right and between frames, with subpixel covariance."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxloc.sensors import StereoRig
 
 
 class MatchingOptions(eqx.Module):
-    """What counts as the same point.
+    """Options of stereo and temporal matching.
 
     Attributes:
         row_tolerance: rows by which a stereo match may be off, px.
@@ -21,7 +21,7 @@ class MatchingOptions(eqx.Module):
         ratio: greatest ratio of the nearest to the second nearest distance.
         window: how far a point may lie from where it is predicted, along each axis, px.
         max_matches: matches between frames that are refined and kept.
-        sigma: standard deviation added to what the patches say: rectification, slanted surfaces, px.
+        sigma: standard deviation added to that of the patches: rectification, slanted surfaces, px.
         disparity_offset: added to measured disparities, px: what the calibration of the pair left over.
         patches: how patches are refined to subpixels.
     """
@@ -38,7 +38,7 @@ class MatchingOptions(eqx.Module):
 
 
 class StereoFeatures(eqx.Module):
-    """What a stereo frame shows: keypoints of the left image with their place in the right one.
+    """Features of a stereo frame: keypoints of the left image with their columns in the right one.
 
     Attributes:
         left: left image, gray levels.
@@ -66,7 +66,7 @@ def match_stereo(
     *,
     options: MatchingOptions = MatchingOptions(),
 ) -> StereoFeatures:
-    """Finds the left keypoints in the right image and refines their columns to subpixels.
+    """Matches keypoints of the left image in the right one and refines their columns to subpixels.
 
     Args:
         left: left image, gray levels.
@@ -100,7 +100,7 @@ def match_frames(
     *,
     options: MatchingOptions = MatchingOptions(),
 ) -> StereoMatches:
-    """Finds the points of a reference frame in the current one and measures them there.
+    """Matches features of a reference frame in the current one and refines them to subpixels.
 
     A point is defined by its patch in the reference's left image, which is therefore exact there; in the current frame
     its place comes from that patch, and its disparity from the patch there.
@@ -109,7 +109,7 @@ def match_frames(
         rig: the stereo rig.
         reference: features of an earlier frame.
         current: features of this frame.
-        prediction: guess of ``T_reference_current``.
+        prediction: initial value of ``T_reference_current``.
         options: what counts as a match.
 
     Returns:
@@ -127,8 +127,8 @@ def match_frames(
         reference.left, current.left, uv_reference, seen[:, jnp.array([0, 2])], options=options.patches
     )
     disparity = jnp.where(known, seen[:, 0] - seen[:, 1], expected[:, 0] - expected[:, 1])
-    guess = jnp.stack([moved.uv[:, 0] - disparity + options.disparity_offset, moved.uv[:, 1]], axis=1)
-    beside = subpixel.refine_stereo(current.left, current.right, moved.uv, guess, options=options.patches)
+    expected = jnp.stack([moved.uv[:, 0] - disparity + options.disparity_offset, moved.uv[:, 1]], axis=1)
+    beside = subpixel.refine_stereo(current.left, current.right, moved.uv, expected, options=options.patches)
     measured = jnp.stack([moved.uv[:, 0], beside.uv[:, 0] - options.disparity_offset, moved.uv[:, 1]], axis=1)
     valid = found.valid[kept] & moved.ok & beside.ok & (measured[:, 0] - measured[:, 1] > 0.5)
     return StereoMatches.of(

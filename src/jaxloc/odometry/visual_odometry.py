@@ -1,4 +1,4 @@
-"""Stereo visual odometry: motions from matched measurements, and the path they add up to."""
+"""Stereo visual odometry: robust motion from matched stereo features."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from jaxloc.solvers.problem import items
 
 
 class MotionOptions(eqx.Module):
-    """How a motion is found among matches of which many are wrong or belong to things that move by themselves.
+    """Options of robust motion estimation.
 
     Attributes:
         hypotheses: P3P samples drawn beside the prediction.
@@ -33,7 +33,7 @@ class MotionOptions(eqx.Module):
 
 
 class CameraMotion(eqx.Module):
-    """A motion between two frames.
+    """Motion estimate between two frames, with its inliers.
 
     Attributes:
         estimate: of ``T_previous_current``.
@@ -61,7 +61,7 @@ def estimate_motion(
     Args:
         rig: the stereo rig.
         matches: measurements in both frames with covariances.
-        prediction: guess of ``T_previous_current``, for example the last motion.
+        prediction: initial value of ``T_previous_current``, for example the last motion.
         key: random key.
         options: how.
 
@@ -81,8 +81,8 @@ def estimate_motion(
         >>> bool(found.estimate.ok)
         True
     """
-    guess = motion_problem(rig, matches, prediction, GemanMcClure(options.kernel))
-    start = _best_start(rig, matches, guess, prediction, key, options)
+    initial_problem = motion_problem(rig, matches, prediction, GemanMcClure(options.kernel))
+    start = _best_start(rig, matches, initial_problem, prediction, key, options)
     robust = motion_problem(rig, matches, start, GemanMcClure(options.kernel))
     rough = solve_graduated(robust, start, factors=(4.0, 2.0), max_steps=15).value
     rough = jax.tree.map(jax.lax.stop_gradient, rough)
@@ -113,9 +113,9 @@ class _OffsetMotion(Problem):
 
 @eqx.filter_jit
 def estimate_disparity_offset(rig: StereoRig, matches: StereoMatches, motion: CameraMotion) -> Estimate:
-    """The constant error of the measured disparities that best explains a motion: near and far points then agree.
+    """Estimates a constant offset of the disparities jointly with the motion (self-calibration).
 
-    A disparity that is too small by a constant makes far points move too far. One motion says little about the offset;
+    A disparity that is too small by a constant makes far points move too far. One motion determines the offset poorly;
     combine the estimates of many by their variances.
 
     Args:

@@ -1,8 +1,8 @@
-"""SLAM by one extended Kalman filter over the pose and all landmarks, with an invariant error.
+"""EKF-SLAM: extended Kalman filter over the pose and all landmarks, with an invariant error.
 
 The error is that of the group of a pose with its points, ``true = exp(xi) estimate``: with it neither the motion nor
-the readings depend on the heading, so that the filter cannot learn a heading which nothing shows. With the usual choice
-of coordinates it does, and grows overconfident.
+the readings depend on the heading, so that the filter cannot gain information about a heading that no reading
+observes. With the usual choice of coordinates it does, and becomes overconfident.
 
 References:
     Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015; Zhang et al., "Convergence and
@@ -33,7 +33,7 @@ _QUARTER = ((0.0, -1.0), (1.0, 0.0))  # turns a vector counter-clockwise by a ri
 
 
 class SlamState(FilterState):
-    """A pose and a map of fixed capacity with their joint covariance.
+    """State of EKF-SLAM: pose and map of fixed capacity, with their joint covariance.
 
     Attributes:
         pose: T_world_robot.
@@ -60,7 +60,7 @@ class SlamState(FilterState):
         return Gaussian(self.pose, matmul(matmul(turn, self.covariance[:3, :3]), turn.T))
 
     def landmark(self, index: Int[Array, ""]) -> Gaussian:
-        """One landmark as a density in the world; without bounds where it was never seen."""
+        """Density of one landmark in the world; of infinite extent where it was never observed."""
         point, rows = self.landmarks[index], 3 + 2 * index + jnp.arange(2)
         block = self.covariance[jnp.r_[jnp.array([2]), rows]][:, jnp.r_[jnp.array([2]), rows]]
         carry = jnp.concatenate([_quarter_turn(point)[:, None], jnp.eye(2, dtype=point.dtype)], axis=1)
@@ -70,12 +70,12 @@ class SlamState(FilterState):
 
 
 class SlamInfo(Info):
-    """What an update of `EkfSlam` says: a `GaussianInfo`, and what became of the reading.
+    """Information about an update of `EkfSlam`: a `GaussianInfo`, and whether the reading was used.
 
     Attributes:
-        log_likelihood: of the reading given all earlier ones; zero where it changed nothing.
+        log_likelihood: of the reading given all earlier ones; zero where it was not used.
         ok: whether the state can be used.
-        innovation: (range, bearing) measured minus expected, zero where there was nothing to expect.
+        innovation: (range, bearing) measured minus expected, zero for a new landmark.
         innovation_covariance: its predicted covariance.
         nis: normalized innovation squared, also of a reading that was refused.
         dof: 2, or 0 where the landmark was not in the map.
@@ -142,13 +142,13 @@ class EkfSlam(Filter):
         turn = turn.at[:2, 2].set(-_quarter_turn(pose.translation))
         block = matmul(matmul(turn, prior.covariance), turn.T)
         covariance = jnp.zeros((size, size), dtype).at[:3, :3].set(block)
-        nothing = jnp.zeros(self.capacity, bool)
+        none = jnp.zeros(self.capacity, bool)
         landmarks = jnp.zeros((self.capacity, 2), dtype)
-        return SlamState(pose, landmarks, covariance, nothing, nothing.astype(jnp.int32), jnp.zeros((), jnp.int32))
+        return SlamState(pose, landmarks, covariance, none, none.astype(jnp.int32), jnp.zeros((), jnp.int32))
 
     @eqx.filter_jit
     def predict(self, state: SlamState, control: Any, *, key: Key[Array, ""] | None = None) -> SlamState:
-        """The robot moves; what is known of the landmarks relative to it changes, they do not."""
+        """Predicts the pose; landmarks stay where they are."""
         del key
         pose = self.motion.move(state.pose, control)
         noise = self.motion.covariance(state.pose, control)
@@ -157,15 +157,15 @@ class EkfSlam(Filter):
         heading = jnp.array([[0.0, 0.0, 1.0]], moved.dtype)
         turned = -matmul(points, jnp.array(_QUARTER, moved.dtype).T).reshape(-1, 1)
         rest = jnp.concatenate([jnp.zeros((turned.shape[0], 2), moved.dtype), turned], axis=1)
-        spread = jnp.concatenate([moved, heading, rest])
-        covariance = state.covariance + matmul(matmul(spread, noise), spread.T)
+        lever = jnp.concatenate([moved, heading, rest])
+        covariance = state.covariance + matmul(matmul(lever, noise), lever.T)
         return SlamState(pose, state.landmarks, covariance, state.seen, state.support, state.step + 1)
 
     @eqx.filter_jit
     def update(
         self, state: SlamState, measurement: RangeBearing, valid: Bool[Array, ""], *, key: Key[Array, ""] | None = None
     ) -> tuple[SlamState, SlamInfo]:
-        """One reading: its landmark and the pose are corrected, or the landmark enters the map."""
+        """Updates pose and landmark by one reading, or adds the landmark to the map."""
         del key
         reading, usable = sanitize(measurement, valid & (measurement.landmark < self.capacity))
         index, nis, fresh = self._associate(state, reading)
@@ -195,21 +195,21 @@ class EkfSlam(Filter):
         own, other = _blocks(jacobian)
         rows = lax.dynamic_slice_in_dim(state.covariance, 3 + 2 * index, 2, axis=0)
         image = matmul(own, state.covariance[:3]) + matmul(other, rows)
-        spread = self._through(image, own, other, index) + jnp.diag(self.deviations**2)
-        gain = solve(cholesky(spread), image).T
+        predicted = self._through(image, own, other, index) + jnp.diag(self.deviations**2)
+        gain = solve(cholesky(predicted), image).T
         left = state.covariance - matmul(gain, image)
         back = matmul(left[:, :3], own.T) + matmul(lax.dynamic_slice_in_dim(left, 3 + 2 * index, 2, axis=1), other.T)
         joseph = left - matmul(back, gain.T) + matmul(gain * self.deviations[None] ** 2, gain.T)
         pose, landmarks = _retract(state, matmul(gain, residual))
         moved = SlamState(pose, landmarks, 0.5 * (joseph + joseph.T), state.seen, state.support, state.step)
-        return moved, residual, spread
+        return moved, residual, predicted
 
     def _through(self, image: Array, own: Array, other: Array, index: Any) -> Array:
         columns = lax.dynamic_slice_in_dim(image, 3 + 2 * index, 2, axis=1)
         return matmul(image[:, :3], own.T) + matmul(columns, other.T)
 
     def _add(self, state: SlamState, reading: RangeBearing, index: Any) -> SlamState:
-        """The state with a landmark put where a reading says: as sure as the position and the reading together."""
+        """The state with a landmark initialized from a reading, with the covariance of pose and reading."""
         sensor = state.pose @ self.mount
         point = locate(sensor, reading)
         start, zero = 3 + 2 * index, jnp.zeros_like(index)
@@ -230,8 +230,8 @@ class EkfSlam(Filter):
             rows = lax.dynamic_slice_in_dim(state.covariance, 3 + 2 * index, 2, axis=0)
             columns = lax.dynamic_slice_in_dim(rows, 3 + 2 * index, 2, axis=1)
             mixed = matmul(matmul(own, rows[:, :3].T), other.T)
-            spread = matmul(matmul(own, state.covariance[:3, :3]), own.T) + matmul(matmul(other, columns), other.T)
-            root = cholesky(spread + mixed + mixed.T + jnp.diag(self.deviations**2))
+            predicted = matmul(matmul(own, state.covariance[:3, :3]), own.T) + matmul(matmul(other, columns), other.T)
+            root = cholesky(predicted + mixed + mixed.T + jnp.diag(self.deviations**2))
             return jnp.sum(whiten(root, residual) ** 2), jnp.sum(jnp.log(jnp.diagonal(root)))
 
         squared, volumes = jax.vmap(distance)(jnp.arange(self.capacity))
@@ -245,17 +245,17 @@ class EkfSlam(Filter):
         return index, squared[within], jnp.where(numbered, ~state.seen[within], unlike)
 
 
-def _inform(residual: Array, spread: Array, known: Array, near: Array, index: Array, adds: Array) -> SlamInfo:
-    """What a reading says; one that is refused, or of a new landmark, counts nothing in the likelihood."""
+def _inform(residual: Array, predicted: Array, known: Array, near: Array, index: Array, adds: Array) -> SlamInfo:
+    """Information about a reading; rejected ones and those of new landmarks do not count in the likelihood."""
     mask = jnp.broadcast_to(known, (2,))
-    spread = mask_covariance(spread, mask)
-    root = cholesky(spread)
+    predicted = mask_covariance(predicted, mask)
+    root = cholesky(predicted)
     residual = jnp.where(mask, residual, 0.0)
     nis = jnp.sum(whiten(root, residual) ** 2)
     volume = jnp.sum(jnp.log(jnp.diagonal(root))) + math.log(2.0 * math.pi) * known.astype(nis.dtype)
     accepted, dof = near | ~known, 2 * known.astype(jnp.int32)
     likelihood = jnp.where(near & known, -0.5 * nis - volume, 0.0)
-    return SlamInfo(likelihood, accepted, residual, spread, nis, dof, accepted, index, adds)
+    return SlamInfo(likelihood, accepted, residual, predicted, nis, dof, accepted, index, adds)
 
 
 def _blocks(jacobian: Float[Array, "2 2"]) -> tuple[Float[Array, "2 3"], Float[Array, "2 2"]]:

@@ -1,4 +1,4 @@
-"""Poses from relative measurements between pairs of them: a graph whose loops are closed by least squares."""
+"""Pose graph optimization: poses from relative measurements, by nonlinear least squares."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from jaxloc.solvers.gauss_newton import Solver
 
 
 class Edges(eqx.Module):
-    """Relative measurements between poses; a fixed number, of which some may be empty.
+    """Edges of a pose graph: relative measurements between poses, padded to a fixed number.
 
     Attributes:
         first: number i of the pose that a measurement is made from.
@@ -38,7 +38,7 @@ class Edges(eqx.Module):
 
     @staticmethod
     def chain(motions: Any, covariance: Float[Array, "m d d"]) -> "Edges":
-        """Odometry: a measurement from each pose to the next."""
+        """Odometry edges: a measurement from each pose to the next."""
         first = jnp.arange(covariance.shape[0], dtype=jnp.int32)
         return Edges(first, first + 1, motions, covariance, jnp.ones(first.shape, bool))
 
@@ -46,7 +46,7 @@ class Edges(eqx.Module):
         return self.first.shape[0]
 
     def join(self, other: "Edges") -> "Edges":
-        """These edges and others."""
+        """Concatenation with other edges."""
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), self, other)
 
 
@@ -54,7 +54,7 @@ class PoseGraph(Problem):
     """``sum_e rho(|r_e|^2)`` with ``r_e = S_e^(-1/2) log(Z_e^-1 T_i^-1 T_j)``; the state is all poses but the first.
 
     Attributes:
-        start: the first pose, held fixed.
+        first: the first pose, held fixed.
         first: of each edge.
         second: of each edge.
         measured: of each edge.
@@ -63,7 +63,7 @@ class PoseGraph(Problem):
         loss: robust kernel, on an edge's squared distance in sigmas.
     """
 
-    start: Any
+    first: Any
     first: Int[Array, " m"]
     second: Int[Array, " m"]
     measured: Any
@@ -73,7 +73,7 @@ class PoseGraph(Problem):
 
     @staticmethod
     def of(edges: Edges, poses: Any, loss: Any) -> "PoseGraph":
-        """The problem of edges and a first guess; empty edges and edges that lead nowhere are made harmless."""
+        """Problem from edges and an initial value; empty and out-of-range edges are masked."""
         count, dof = poses.batch_shape[0], edges.covariance.shape[-1]
         good = edges.valid & (edges.first >= 0) & (edges.second >= 0)
         good = good & (edges.first < count) & (edges.second < count) & (edges.first != edges.second)
@@ -89,13 +89,13 @@ class PoseGraph(Problem):
 
     def _errors(self, state: Any) -> tuple[Any, Any, Float[Array, "m d"]]:
         """Poses at both ends of each edge, and what the measurement misses."""
-        poses = jax.tree.map(lambda head, rest: jnp.concatenate([head[None], rest]), self.start, state)
+        poses = jax.tree.map(lambda head, rest: jnp.concatenate([head[None], rest]), self.first, state)
         near, far = _at(poses, self.first), _at(poses, self.second)
         missed = jax.vmap(lambda z, a, b: (z.inverse() @ (a.inverse() @ b)).log())(self.measured, near, far)
         return near, far, jnp.where(self.valid[:, None], missed, 0.0)
 
     def residual(self, state: Any) -> Float[Array, "d m"]:
-        """Errors of the edges in sigmas."""
+        """Whitened errors of the edges."""
         missed = self._errors(state)[2]
         return jnp.einsum("mij,mj->im", self.whitener, missed, precision="highest")
 
@@ -103,7 +103,7 @@ class PoseGraph(Problem):
         """In closed form: ``dr = S^(-1/2) Jr(r)^-1 (d_j - Ad(T_j^-1 T_i) d_i)``."""
         near, far, missed = self._errors(state)
         dof, count = missed.shape[1], state.batch_shape[0]
-        group = type(self.start)
+        group = type(self.first)
         by_second = matmul(self.whitener, jax.vmap(lambda r: group.left_jacobian_inverse(-r))(missed))
         by_second = jnp.where(self.valid[:, None, None], by_second, 0.0)
         by_first = -matmul(by_second, jax.vmap(lambda a, b: (b.inverse() @ a).adjoint())(near, far))
@@ -120,14 +120,14 @@ class PoseGraph(Problem):
 def optimize(
     poses: Any, edges: Edges, *, loss: Any = Quadratic(), solver: Solver = LevenbergMarquardt(), max_steps: int = 50
 ) -> Estimate:
-    """The poses that agree best with relative measurements; the first stays where it is.
+    """Optimizes a pose graph; the first pose is fixed.
 
     Minimizes ``sum_e rho(|log(Z_e^-1 T_i^-1 T_j)|^2)`` in the metric of the covariances, with the Jacobian in closed
     form. The normal equations are **dense**: n poses of d directions cost memory of (n d)^2 numbers and time of (n d)^3
     a step, which suits up to a few hundred poses; longer graphs want a sparse factorization.
 
     Args:
-        poses: first guess, stacked along "n"; any group of `jaxloc.poses`.
+        poses: initial value, stacked along "n"; any group of `jaxloc.poses`.
         edges: the measurements, some of them perhaps empty.
         loss: robust kernel, on an edge's distance in sigmas, against wrong loop closures.
         solver: of the iterations.
@@ -154,8 +154,8 @@ def optimize(
         >>> odometry = pose_graph.Edges.chain(part(slice(3)), noise[:3])
         >>> last, start = jnp.array([3]), jnp.array([0])
         >>> closure = pose_graph.Edges(last, start, part(slice(3, 4)), noise[3:], jnp.array([True]))
-        >>> guess = jl.poses.trajectory.chain(jl.poses.SE2(0.0, 0.0, 0.0), odometry.T_first_second)
-        >>> fit = pose_graph.optimize(guess, odometry.join(closure))
+        >>> initial = jl.poses.trajectory.chain(jl.poses.SE2(0.0, 0.0, 0.0), odometry.T_first_second)
+        >>> fit = pose_graph.optimize(initial, odometry.join(closure))
         >>> bool(fit.ok), round(float(fit.value.translation[2, 0]), 2)
         (True, 1.0)
     """
@@ -168,14 +168,14 @@ def optimize(
         )
     problem = PoseGraph.of(edges, poses, loss)
     fit = solve(problem, _at(poses, slice(1, None)), solver=solver, max_steps=max_steps)
-    value = jax.tree.map(lambda head, rest: jnp.concatenate([head[None], rest]), problem.start, fit.value)
+    value = jax.tree.map(lambda head, rest: jnp.concatenate([head[None], rest]), problem.first, fit.value)
     pad = ((poses.dof, 0), (poses.dof, 0))
     covariance, information = jnp.pad(fit.covariance, pad), jnp.pad(fit.information, pad)
     return Estimate(value, covariance, fit.cost, fit.ok, fit.num_steps, fit.status, information)
 
 
 def marginals(fit: Estimate) -> Float[Array, "n d d"]:
-    """The covariance of each pose alone, out of that of all.
+    """Marginal covariance of each pose.
 
     Args:
         fit: what `optimize` returned.
@@ -187,8 +187,8 @@ def marginals(fit: Estimate) -> Float[Array, "n d d"]:
         >>> import jax, jax.numpy as jnp, jaxloc as jl
         >>> from jaxloc.slam import pose_graph
         >>> motion = jax.vmap(jl.poses.SE2)(jnp.ones(1), jnp.zeros(1), jnp.zeros(1))
-        >>> guess = jl.poses.trajectory.chain(jl.poses.SE2(0.0, 0.0, 0.0), motion)
-        >>> fit = pose_graph.optimize(guess, pose_graph.Edges.chain(motion, 0.04 * jnp.eye(3)[None]))
+        >>> initial = jl.poses.trajectory.chain(jl.poses.SE2(0.0, 0.0, 0.0), motion)
+        >>> fit = pose_graph.optimize(initial, pose_graph.Edges.chain(motion, 0.04 * jnp.eye(3)[None]))
         >>> [round(float(x), 2) for x in pose_graph.marginals(fit)[1].diagonal()]
         [0.04, 0.04, 0.04]
     """

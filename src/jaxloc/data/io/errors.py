@@ -1,10 +1,10 @@
-"""The error that readers raise."""
+"""Exception raised by readers and writers."""
 
 from pathlib import Path
 
 
 class DataError(ValueError):
-    """Input that cannot be used: one line that names the file and says what is wrong with it.
+    """Unusable input: a one-line message that names the file and the fault.
 
     Args:
         path: the file or folder at fault.

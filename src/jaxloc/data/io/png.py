@@ -1,4 +1,4 @@
-"""Grayscale images from PNG files, refused when a byte is missing or wrong.
+"""Grayscale PNG images, verified by their checksums.
 
 OpenCV returns a partly gray image for a truncated PNG, silently. Here the chunks are walked first: their lengths must
 lead to the end chunk, and their checksums must be right (PNG specification, ISO/IEC 15948, section 5.3).

@@ -1,4 +1,4 @@
-"""Rows of numbers in text files, with errors that name the file and the line."""
+"""Text files of numbers, with errors that name the file and the line."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Files that are never half-written: whole, or not there.
+"""Atomic writing of files.
 
 Everything is written beside its place under a temporary name and moved there in one step, so that a reader never
 sees half a file and a failed run leaves the files of the run before it.
@@ -45,7 +45,7 @@ def write_file(path: Path | str, content: str | bytes) -> None:
 
 
 class RowWriter:
-    r"""A text file that grows by whole rows, and takes its place when the block that writes it ends.
+    r"""Text file written row by row, renamed to its final name when its block ends.
 
     An interrupt (Ctrl-C) keeps the rows written so far; any other error throws them away and leaves the file that was
     there before.

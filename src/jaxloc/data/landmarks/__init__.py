@@ -1,4 +1,4 @@
-"""Drives among point landmarks, as the steps of a filter."""
+"""Recordings with point landmarks, as filter steps."""
 
 from jaxloc.data.landmarks import factors, log, mrclam, ranging
 from jaxloc.data.landmarks.factors import read_factors

@@ -1,4 +1,4 @@
-"""Drives as factor lists with known correspondences, such as Victoria Park: ``ODOMETRY`` and ``LANDMARK`` lines.
+"""Factor lists with known correspondences, such as Victoria Park: ``ODOMETRY`` and ``LANDMARK`` lines.
 
 References:
     Guivant and Nebot, "Optimization of the simultaneous localization and map-building algorithm", IEEE T-RA 2001.

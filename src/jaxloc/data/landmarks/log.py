@@ -1,4 +1,4 @@
-"""Drives among landmarks: what odometry and one sensor said, merged into the steps of a filter."""
+"""Landmark recordings: odometry and one sensor, merged into filter steps."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from jaxloc.sensors import Increment, Range, RangeBearing
 
 
 class LandmarkLog(eqx.Module):
-    """A drive in steps that each end in a reading (or, where it is not valid, in nothing).
+    """Landmark recording as filter steps, each with a control and at most one reading.
 
     Attributes:
         start: stamp of time zero, s (a host number in double precision).
@@ -50,7 +50,7 @@ class LandmarkLog(eqx.Module):
         return LandmarkLog(self.start, times, increments, readings, valid, *fixed, truth, truth_valid)
 
     def renumbered(self, numbers: Int64[np.ndarray, " k"]) -> "LandmarkLog":
-        """The log with other rows of the map for its readings: ``numbers[i]`` in place of i."""
+        """The log with renumbered landmarks: ``numbers[i]`` in place of i."""
         rows = jnp.asarray(numbers, self.readings.landmark.dtype)[self.readings.landmark]
         return eqx.tree_at(lambda log: log.readings.landmark, self, rows)
 

@@ -1,4 +1,4 @@
-"""A museum with a ceiling of coffers, lamps and skylights, and a robot that drives below it and looks up."""
+"""Simulated ceiling with lamps and skylights, and drives of an upward-looking robot below it."""
 
 import cv2
 import equinox as eqx

@@ -1,4 +1,4 @@
-"""A concrete floor, a camera that looks straight down at it, and a drive round a loop with exact truth.
+"""Simulated concrete floor, a downward camera, and a drive around a loop with ground truth.
 
 The floor *is* the bicubic interpolant of its texture, which is band-limited: where an image was taken is known to any
 fraction of a pixel. Images average several rays a pixel, as a sensor does, through a lens and its vignetting.
@@ -20,7 +20,7 @@ _BLUR = 1.0  # of the finished texture, texels: leaves 1 % of the contrast at th
 
 
 class Floor(eqx.Module):
-    """An image of a floor, seen from above.
+    """Top view of a floor.
 
     Args:
         texture: "rows columns", gray levels; columns run along x, rows along y.
@@ -34,7 +34,7 @@ class Floor(eqx.Module):
 
 
 class FloorCamera(eqx.Module):
-    """A camera that looks at the floor from straight above, and the faults of its images.
+    """Downward camera with lens distortion, vignetting and noise.
 
     Args:
         ground: camera, lens and height; its road frame has x to the top of the image and y to its left.
@@ -61,7 +61,7 @@ class FloorCamera(eqx.Module):
 
 
 class FloorDrive(eqx.Module):
-    """Images of a floor and what is known of where they were taken.
+    """Images of a floor with odometry and true poses.
 
     Attributes:
         floor: below.
@@ -152,7 +152,7 @@ def make_camera(
 
 
 class Photographer:
-    """Takes images of a floor at exact poses.
+    """Renders images of a floor at given poses.
 
     Args:
         floor: below.
@@ -216,7 +216,7 @@ def drive_loop(
     floor: Floor | None = None,
     sigmas: tuple[float, float, float] = (4e-4, 3e-4, 4e-3),
 ) -> FloorDrive:
-    """Drives once round a circle with a wobble: the last image overlaps the first.
+    """Simulates a drive once around a perturbed circle: the last image overlaps the first.
 
     Args:
         seed: fixes floor, path and all noise.
@@ -257,7 +257,7 @@ def drive_loop(
 
 
 def _view_radius(camera: FloorCamera) -> float:
-    """How far from the foot of the axis the corners of an image look, m."""
+    """Distance of the corners of the field of view from the foot of the optical axis, m."""
     rows, columns = camera.shape
     u, v = jnp.array([-0.5, columns - 0.5]), jnp.array([-0.5, rows - 0.5])
     x, y = camera.ground.to_ground_components(u, v)

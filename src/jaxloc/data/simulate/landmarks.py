@@ -1,4 +1,4 @@
-"""Drives among point landmarks with exactly known noise: the worlds in which SLAM filters are tested for honesty."""
+"""Simulated drives among point landmarks with known noise, for consistency tests of SLAM filters."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ class LandmarkDrive(eqx.Module):
     """A simulated drive.
 
     Attributes:
-        increments: what odometry says of each step, stacked.
+        increments: odometry increments of all steps, stacked.
         readings: one at the end of each step, stacked.
         valid: whether a landmark was seen.
         poses: true T_world_robot after each step, stacked.
@@ -43,7 +43,7 @@ def simulate_landmarks(
     reach: float = 8.0,
     laps: float = 2.0,
 ) -> LandmarkDrive:
-    """Laps on a circle that starts at the origin, among landmarks scattered along it.
+    """Simulates laps on a circle that starts at the origin, with landmarks scattered along it.
 
     Odometry reports the plan, and the robot does not quite follow it: true motion is a draw from the motion model. Each
     step ends in a reading of one random landmark within reach, if there is one.

@@ -1,4 +1,4 @@
-"""A robot with a laser in a building: an exact map, exact ranges to its walls, and odometry that errs.
+"""Simulated building with a laser robot: exact map and ranges, noisy odometry.
 
 Walls and furniture are rectangles along the axes, so that ranges are exact whatever the map's resolution.
 """
@@ -19,7 +19,7 @@ _MARGIN = 0.5
 
 
 class Building(eqx.Module):
-    """Rectangles that block the way, and a path between them.
+    """Building of rectangular obstacles, and a path between them.
 
     Args:
         boxes: "k 4" (x_low, y_low, x_high, y_high), m.

@@ -1,8 +1,7 @@
-"""Images of a pallet on a floor before a wall, with exact truth.
+"""Simulated images of a pallet on a floor before a wall, with ground truth.
 
-Every pixel looks along one ray at the face of the pallet, the floor or the wall. Rims of the holes and of the face are
-blurred by a Gaussian in the image, in closed form, so that an edge lies where its geometry says to a small fraction
-of a pixel.
+Every pixel is the intersection of one ray with the face of the pallet, the floor or the wall. Rims of the holes and of
+the face are blurred by a Gaussian in the image, in closed form, so that edges are exact to a small fraction of a pixel.
 """
 
 import cv2
@@ -17,7 +16,7 @@ from jaxloc.sensors import GroundCamera, Pinhole
 
 
 class PalletScene(eqx.Module):
-    """What is in the image beside the pose.
+    """Scene parameters beside the pose of the pallet.
 
     Args:
         wood: gray level of the face.
@@ -124,7 +123,7 @@ def _surroundings(rays, height: float, scene: PalletScene, rng: np.random.Genera
 def _draw(
     image, kind: PalletType, pose, rays, height: float, scene: PalletScene, rng: np.random.Generator
 ) -> Float64[np.ndarray, "h w"]:
-    """The face over the image, with its shadow on the floor left out: only edges of the face are told."""
+    """The face over the image, with its shadow on the floor left out: only edges of the face remain."""
     along, level, ahead = _on_face(pose, rays, height)
 
     def cover(value: np.ndarray, rim: float) -> np.ndarray:

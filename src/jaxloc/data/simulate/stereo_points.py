@@ -1,4 +1,4 @@
-"""Stereo measurements of points along a drive, without images: for drift and consistency over many frames and seeds."""
+"""Simulated stereo measurements of points along a drive, without images, for drift and consistency tests."""
 
 import equinox as eqx
 import jax
@@ -30,7 +30,7 @@ class StereoPairs(eqx.Module):
 
 
 class StereoDrive(eqx.Module):
-    """A drive and what was measured on it.
+    """A drive with its stereo measurements.
 
     Args:
         pairs: one stacked pair for each motion between successive frames.

@@ -1,4 +1,4 @@
-"""Many targets that appear, move and vanish, seen among clutter: the two scenarios on which PHD filters are compared.
+"""Simulated multi-target scenarios with clutter: the two on which PHD filters are commonly compared.
 
 References:
     Vo and Ma, "The Gaussian mixture probability hypothesis density filter", IEEE TSP 2006. [T-74]
@@ -57,7 +57,7 @@ _TURNING = (
 
 
 class TargetScenario(eqx.Module):
-    """What targets do and what is seen of them; its fields are what the model of a tracker needs.
+    """Multi-target scenario: motion, measurement, clutter, birth and death parameters.
 
     Scans are a second apart and counted from 1.
 
@@ -312,7 +312,7 @@ class TargetDrive(eqx.Module):
 
 @eqx.filter_jit
 def simulate_targets(scenario: TargetScenario, *, key: Key[Array, ""]) -> TargetDrive:
-    """Targets that follow their motion exactly, measured with noise, now and then missed, among uniform clutter.
+    """Simulates targets with noisy measurements, missed detections and uniform clutter.
 
     Args:
         scenario: what is there.
@@ -330,7 +330,7 @@ def simulate_targets(scenario: TargetScenario, *, key: Key[Array, ""]) -> Target
     """
     truth, there = _true_states(scenario)
     keys = jax.random.split(key, scenario.num_scans)
-    scans = jax.vmap(lambda states, alive, k: _scan(scenario, states, alive, k))(truth, there, keys)
+    scans = jax.vmap(lambda states, present, k: _scan(scenario, states, present, k))(truth, there, keys)
     return TargetDrive(truth, there, *scans)
 
 
@@ -349,7 +349,7 @@ def _true_states(scenario: TargetScenario) -> tuple[Float[Array, "t n d"], Bool[
 
 
 def _scan(
-    scenario: TargetScenario, states: Float[Array, "n d"], alive: Bool[Array, " n"], key: Key[Array, ""]
+    scenario: TargetScenario, states: Float[Array, "n d"], present: Bool[Array, " n"], key: Key[Array, ""]
 ) -> tuple[Any, Bool[Array, " m"], Int[Array, " m"]]:
     """Measurements of one scan: those of targets first, then clutter, then mixed."""
     key_seen, key_noise, key_count, key_place, key_order = jax.random.split(key, 5)
@@ -360,7 +360,7 @@ def _scan(
     def measure(state, normal):
         return retract(sensor.expect(state, example), matmul(cholesky(sensor.covariance(state, example)), normal))
 
-    seen = alive & (jax.random.uniform(key_seen, (count,), dtype) < scenario.detection)
+    seen = present & (jax.random.uniform(key_seen, (count,), dtype) < scenario.detection)
     found = jax.vmap(measure)(states, jax.random.normal(key_noise, (count, 2), dtype))
     places = jax.random.uniform(key_place, (room, 2), dtype)
     false = jax.vmap(lambda place: scenario.reading(scenario.low + place * (scenario.high - scenario.low)))(places)

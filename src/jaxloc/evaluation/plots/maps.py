@@ -1,4 +1,4 @@
-"""Figures of localization in a map: paths and clouds of particles over it, errors and confidence over time.
+"""Plots over a map: paths, particles, and curves over time.
 
 matplotlib is an extra, loaded when the first figure is drawn; its global state (pyplot) is never touched.
 """
@@ -38,12 +38,12 @@ class MapImage(eqx.Module):
         origin: tuple[float, float, float],
         resolution: float,
     ) -> "MapImage":
-        """Dark obstacles, white free space, and gray where nothing is known."""
+        """Map image: dark obstacles, white free space, gray unknown cells."""
         return MapImage(np.where(occupied, _WALL, np.where(free, _FREE, _UNKNOWN)), origin, resolution)
 
 
 class Snapshot(eqx.Module):
-    """A cloud at one instant.
+    """Particles at one time.
 
     Args:
         title: when.
@@ -93,7 +93,7 @@ def draw_map_path(
 
 
 def draw_clouds(grid: MapImage, snapshots: Sequence[Snapshot]) -> "Figure":
-    """Draws clouds of particles over a map, one image for each instant.
+    """Draws particles over a map, one panel for each time.
 
     Args:
         grid: the map.

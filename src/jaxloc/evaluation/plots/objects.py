@@ -20,7 +20,7 @@ def draw_objects(
     labels: Int[np.ndarray, " m"],
     speeds: Float[np.ndarray, " m"],
 ) -> "Figure":
-    """A frame with what moves in it.
+    """Draws moving points, objects and tracks on a frame.
 
     Args:
         image: gray image.
@@ -54,7 +54,7 @@ def draw_objects(
 
 
 def encode(figure: "Figure") -> bytes:
-    """The image as a PNG file."""
+    """Encodes an image as PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI)
     return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Figures of tracks: paths from above, and how many there are.
+"""Plots of tracks: paths from above, and counts over time.
 
 matplotlib is an extra, loaded when the first figure is drawn; its global state (pyplot) is never touched.
 """

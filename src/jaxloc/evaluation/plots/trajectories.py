@@ -1,4 +1,4 @@
-"""Figures: paths from above, drift, matches on an image, stage timings.
+"""Plots of trajectories: path from above, uncertainty, drift, matches, stage timings.
 
 matplotlib is an extra, loaded when the first figure is drawn; its global state (pyplot) is never touched.
 """

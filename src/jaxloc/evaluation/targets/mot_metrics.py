@@ -1,4 +1,4 @@
-"""Whether tracks keep their identities: CLEAR MOT, IDF1 and HOTA.
+"""Multi-object tracking metrics: CLEAR MOT, IDF1 and HOTA.
 
 Host code in double precision: ragged frames come in, a few numbers go out.
 
@@ -24,11 +24,11 @@ _CONTINUED = 1000.0  # worth of a pair that goes on from the frame before, above
 
 
 class Similarity(eqx.Module):
-    """How alike two objects are: one where they are the same, zero where they have nothing to do with each other."""
+    """Similarity of two objects in [0, 1] (strategy)."""
 
     @abstractmethod
     def between(self, truth: Float[np.ndarray, "n d"], found: Float[np.ndarray, "k d"]) -> Float64[np.ndarray, "n k"]:
-        """Of each pair; zero where a number is bad."""
+        """Similarity of each pair; zero where non-finite."""
 
 
 class BoxOverlap(Similarity):
@@ -91,7 +91,7 @@ class Comparison(eqx.Module):
         return zip(self.truth_ids, self.ids, self.similarity, strict=True)
 
     def counts(self) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " k"]]:
-        """In how many frames each identity is there."""
+        """Number of frames in which each identity is present."""
         sides = (self.truth_ids, self.num_truth), (self.ids, self.num_found)
         empty = np.zeros(0, np.int64)
         one, other = (np.bincount(np.concatenate([empty, *ids]), minlength=n).astype(np.float64) for ids, n in sides)
@@ -125,7 +125,7 @@ class ClearMot(eqx.Module):
 
 
 class IdF1(eqx.Module):
-    """How much of each identity is one track.
+    """IDF1 with identity precision and recall.
 
     Attributes:
         f1: of precision and recall.
@@ -199,7 +199,7 @@ def compare(
 
 
 def join(comparisons: Sequence[Comparison]) -> Comparison:
-    """Sequences one after the other, with identities of their own: the metrics of a whole benchmark.
+    """Concatenates sequences with separate identities, for metrics of a whole benchmark.
 
     Example:
         >>> one = np.zeros(1, np.int64)
@@ -229,8 +229,8 @@ def clear_mot(tracks: Comparison, *, threshold: float = 0.5) -> ClearMot:
     References:
         Bernardin and Stiefelhagen 2008, section 2. [T-65]
     """
-    nobody = np.full(tracks.num_truth, -1)
-    last, before = nobody.copy(), nobody.copy()
+    none = np.full(tracks.num_truth, -1)
+    last, before = none.copy(), none.copy()
     matched, pieces = np.zeros(tracks.num_truth), np.zeros(tracks.num_truth, np.int64)
     switches, total = 0, 0.0
     for truth_ids, ids, similarity in tracks:
@@ -241,7 +241,7 @@ def clear_mot(tracks: Comparison, *, threshold: float = 0.5) -> ClearMot:
         rows, columns = _best_pairs(np.where(near, _CONTINUED * goes_on + similarity, 0.0))
         who, track = truth_ids[rows], ids[columns]
         switches += int(((last[who] >= 0) & (last[who] != track)).sum())
-        now = nobody.copy()
+        now = none.copy()
         now[who] = last[who] = track
         pieces += (before < 0) & (now >= 0)
         before = now

@@ -1,4 +1,4 @@
-"""How far a set of targets is from the true set: localization, missed and false targets in one number.
+"""OSPA, GOSPA and OSPA(2) distances between sets of targets.
 
 Sets are padded: values with a mask. Estimates come first, truth second.
 
@@ -77,7 +77,7 @@ def ospa(
     ``(1/n min_pi sum_i min(d_i, c)^p + c^p |n - m| / n)^(1/p)``, where n is the larger number; zero for two empty sets.
 
     Args:
-        x: estimates; those with bad numbers count, and match nothing.
+        x: estimates; non-finite ones count, and match none.
         valid_x: which there are.
         y: true points.
         valid_y: which there are.
@@ -122,7 +122,7 @@ def gospa(
     ``c^p / 2``.
 
     Args:
-        x: estimates; those with bad numbers count, and match nothing.
+        x: estimates; non-finite ones count, and match none.
         valid_x: which there are.
         y: true points.
         valid_y: which there are.
@@ -174,7 +174,7 @@ def ospa2(
     window: int,
     order: float = 1.0,
 ) -> Ospa:
-    """The OSPA(2) distance of two sets of tracks over a sliding window: who swaps or breaks tracks pays for it.
+    """The OSPA(2) distance of two sets of tracks over a sliding window, which penalizes identity switches and breaks.
 
     The distance of two tracks is their error on average over the instants at which either is there; where only one is,
     it is the cutoff. The distance of the sets is the OSPA distance in that measure.

@@ -1,4 +1,4 @@
-"""How an estimated path is moved onto the true one before the two are compared."""
+"""Alignment of an estimated trajectory with the true one."""
 
 from abc import abstractmethod
 
@@ -11,7 +11,7 @@ from jaxloc._linalg import matmul
 
 
 class Alignment(eqx.Module):
-    """How an estimated path is moved onto the true one before they are compared."""
+    """Alignment of an estimated trajectory with the true one (strategy)."""
 
     @abstractmethod
     def align(

@@ -10,7 +10,7 @@ from jaxloc.poses import Trajectory
 
 
 class Errors(eqx.Module):
-    """Error values, some of which may not count.
+    """Error values with a validity mask.
 
     Args:
         values: one a pose or pair of poses; zero where not valid.

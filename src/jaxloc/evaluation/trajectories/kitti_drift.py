@@ -1,4 +1,4 @@
-"""Drift: how fast the error of dead reckoning grows with the distance traveled."""
+"""KITTI odometry metric: drift of translation and rotation over path segments."""
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 
 class SegmentErrors(eqx.Module):
-    """Errors over stretches of the path of several lengths, from several first frames.
+    """Errors over path segments of several lengths and first frames.
 
     Args:
         translation: m a meter.
@@ -127,7 +127,7 @@ def fitting_lengths(length: float) -> tuple[float, ...]:
 
 @eqx.filter_jit
 def end_drift_percent(estimate: Trajectory, truth: Trajectory) -> Float[Array, ""]:
-    """How far the end of the path is off, both paths starting from the same pose, in % of the distance traveled.
+    """Position error at the end of the path, in % of the distance traveled, both paths starting from the same pose.
 
     Args:
         estimate: the estimated path.

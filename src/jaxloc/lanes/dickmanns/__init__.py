@@ -1,6 +1,6 @@
-"""Dickmanns: borders of a lane by sums along their predicted direction, for a clothoid in a Kalman filter."""
+"""Dickmanns's lane tracker: lane borders by sums along their predicted direction, and a clothoid in a Kalman filter."""
 
-from jaxloc.lanes.dickmanns.borders import Borders, Trust, measure
+from jaxloc.lanes.dickmanns.borders import Borders, EdgeThresholds, measure
 from jaxloc.lanes.dickmanns.edges import Edge, EdgeDetector, LightStripe, SingleEdge, find_edge
 from jaxloc.lanes.dickmanns.model import BorderSensor, LaneMotion, Ride, RoadState
 from jaxloc.lanes.dickmanns.windows import ColumnSums, Windows, sum_columns
@@ -16,7 +16,7 @@ __all__ = [
     "Ride",
     "RoadState",
     "SingleEdge",
-    "Trust",
+    "EdgeThresholds",
     "Windows",
     "find_edge",
     "measure",

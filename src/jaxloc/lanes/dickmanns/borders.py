@@ -1,4 +1,4 @@
-"""The borders of a lane in one image, where a prediction says to look."""
+"""Measurement of lane borders in windows around their predicted positions."""
 
 import equinox as eqx
 import jax
@@ -13,8 +13,8 @@ from jaxloc.lanes.dickmanns.windows import Windows, sum_columns
 from jaxloc.sensors.ground_camera import GroundCamera
 
 
-class Trust(eqx.Module):
-    """When an edge is taken for the border.
+class EdgeThresholds(eqx.Module):
+    """Thresholds for an edge to be accepted as the lane border.
 
     Args:
         snr: least response, in its own standard deviations.
@@ -32,12 +32,12 @@ class Trust(eqx.Module):
 
 
 class Borders(eqx.Module):
-    """What was found along both borders; windows of the left one first.
+    """Border measurements of all windows, those of the left border first.
 
     Attributes:
         columns: in which the borders cross `sensor.rows`, px; the predicted ones where not found.
         found: which were.
-        sensor: what tells a filter how the columns follow from the state.
+        sensor: measurement model of the columns.
         predicted: columns by the prediction, px.
         visible: which windows are in the image.
     """
@@ -57,9 +57,9 @@ def measure(
     windows: Windows | None = None,
     *,
     detector: EdgeDetector = LightStripe(),
-    trust: Trust = Trust(),
+    thresholds: EdgeThresholds = EdgeThresholds(),
 ) -> Borders:
-    """Looks for the borders in windows about their predicted places.
+    """Measures the borders in windows around their predicted positions.
 
     Each window is searched only as far as the prediction is uncertain, and what lies farther off than its gate is left
     out [K-31].
@@ -68,9 +68,9 @@ def measure(
         image: gray levels.
         ground: the camera with its mean pitch.
         predicted: a `RoadState` and its covariance.
-        windows: where to look; `Windows()` by default.
+        windows: measurement windows; `Windows()` by default.
         detector: what a border is.
-        trust: when to believe an edge.
+        thresholds: acceptance thresholds of an edge.
 
     Returns:
         The borders, for `jaxloc.filters.ExtendedKalmanFilter.update` with ``sensor``, ``columns`` and ``found``.
@@ -98,19 +98,19 @@ def measure(
     )
     sensor = BorderSensor(ground, rows, ranges, sides, jnp.ones_like(rows))
     _, jacobian = sensor.linearize(state, columns)
-    spread = jnp.sum(matmul(jacobian, predicted.covariance) * jacobian, axis=1)
+    predicted_variance = jnp.sum(matmul(jacobian, predicted.covariance) * jacobian, axis=1)
     per_meter = jnp.maximum(jnp.abs(scale), 1e-3)
-    within = jnp.clip(trust.gate * jnp.sqrt(spread) / per_meter + 0.1, 0.2, windows.reach)
+    within = jnp.clip(thresholds.gate * jnp.sqrt(predicted_variance) / per_meter + 0.1, 0.2, windows.reach)
     sums = sum_columns(image, ground, state, windows)
     # Samples nearer to each other than a pixel are not independent.
     crowd = jnp.maximum(1.0 / (per_meter * 2.0 * windows.reach / (windows.columns - 1)), 1.0)
     edges = jax.vmap(lambda p, n, w: find_edge(p, n, windows.reach, within=w, detector=detector))(
         sums.profile, sums.variance * crowd, within
     )
-    variance = scale**2 * (edges.variance + trust.paint**2) + trust.pixels**2
+    variance = scale**2 * (edges.variance + thresholds.paint**2) + thresholds.pixels**2
     moved = scale * edges.place
-    near = moved**2 <= trust.gate**2 * (spread + variance)
-    found = sums.seen & edges.ok & (edges.snr > trust.snr) & (edges.contrast > trust.contrast) & near
+    near = moved**2 <= thresholds.gate**2 * (predicted_variance + variance)
+    found = sums.seen & edges.ok & (edges.snr > thresholds.snr) & (edges.contrast > thresholds.contrast) & near
     variance = jnp.where(found, variance, 1.0)
     sensor = eqx.tree_at(lambda s: s.variances, sensor, variance)
     return Borders(jnp.where(found, columns + moved, columns), found, sensor, columns, sums.seen)

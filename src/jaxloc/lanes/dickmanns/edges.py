@@ -1,4 +1,4 @@
-"""Edges of a profile: where a smoothed derivative peaks, and how well that place is known."""
+"""Edges of a gray-level profile: peaks of a smoothed derivative, with their variance."""
 
 from abc import abstractmethod
 
@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 
 class EdgeDetector(eqx.Module):
-    """What an edge is; a strategy. A kernel is correlated with the profile, and the greatest response is the border."""
+    """Edge detector (strategy): a kernel correlated with the profile, whose greatest response is the border."""
 
     @abstractmethod
     def kernel(self, offsets: Float[Array, " k"]) -> Float[Array, " k"]:
@@ -66,7 +66,7 @@ def _slope(offsets: Float[Array, " k"], sigma: float) -> Float[Array, " k"]:
 
 
 class Edge(eqx.Module):
-    """Where a border was found in a profile.
+    """Position of an edge in a profile.
 
     Attributes:
         place: distance to the left of the middle of the profile, m.
@@ -137,9 +137,9 @@ def find_edge(
     slope = 0.5 * (kernel[2:] - kernel[:-2])
     noise = jnp.maximum(variance, jnp.finfo(dtype).tiny)
     place = places[middle] - spacing * jnp.clip(0.5 * (after - before) / bend, -0.5, 0.5)
-    spread = spacing**2 * noise * jnp.sum(slope**2) / bend**2
+    variance = spacing**2 * noise * jnp.sum(slope**2) / bend**2
     scale = jnp.maximum(detector.contrast(kernel, offsets), 1e-20)
     deviation = jnp.sqrt(noise * jnp.sum(kernel**2))
-    ok = peaked & (middle == best) & jnp.isfinite(place) & jnp.isfinite(spread)
-    place, spread = jnp.where(ok, place, 0.0), jnp.where(ok, spread, 1.0)
-    return Edge(place, spread, jnp.where(ok, peak / scale, 0.0), jnp.where(ok, peak / deviation, 0.0), ok)
+    ok = peaked & (middle == best) & jnp.isfinite(place) & jnp.isfinite(variance)
+    place, variance = jnp.where(ok, place, 0.0), jnp.where(ok, variance, 1.0)
+    return Edge(place, variance, jnp.where(ok, peak / scale, 0.0), jnp.where(ok, peak / deviation, 0.0), ok)

@@ -1,4 +1,4 @@
-"""The clothoid as a state: how it moves on with the vehicle, and where its borders appear in the image."""
+"""Clothoid lane model for a Kalman filter: state, motion model and border measurement model."""
 
 from typing import Any
 
@@ -17,12 +17,12 @@ _STEPS = 3  # of Newton's iteration for the range that a row shows, before the o
 
 
 class RoadState(eqx.Module):
-    """What is tracked; its tangent has the order offset, heading, curvature, rate, width, pitch.
+    """State of the lane filter; its tangent has the order offset, heading, curvature, curvature rate, width, pitch.
 
     Args:
         lane: beside the vehicle.
         width: of the lane, from the middle of one border to that of the other, m.
-        pitch: how much further down the camera looks than its mean, rad.
+        pitch: pitch of the camera relative to its mean, positive down, rad.
     """
 
     lane: Lane
@@ -43,7 +43,7 @@ class RoadState(eqx.Module):
 
 
 class Ride(eqx.Module):
-    """What one step of the filter is told.
+    """Control input of one filter step.
 
     Args:
         dt: s since the last image.
@@ -63,7 +63,7 @@ class Ride(eqx.Module):
 
 
 class LaneMotion(Motion):
-    """The road comes nearer; curvature changes as it does on roads, pitch swings back.
+    """Motion model: the vehicle advances along the lane, curvature is a random walk, pitch returns to its mean.
 
     All sigmas are of random walks, by the root of the time or way over which they act.
 
@@ -106,7 +106,7 @@ class LaneMotion(Motion):
         return RoadState(lane, state.width, state.pitch * jnp.exp(-control.dt / self.pitch_time))
 
     def covariance(self, state: RoadState, control: Ride) -> Float[Array, "6 6"]:
-        """Of the six random walks."""
+        """Process noise covariance of the six components."""
         time, way = control.dt, control.speed * control.dt
         rate = self.bend**2 * way
         swing = self.pitch**2 * (1.0 - jnp.exp(-2.0 * time / self.pitch_time))
@@ -117,7 +117,7 @@ class LaneMotion(Motion):
 
 
 class BorderSensor(Sensor):
-    """Columns in which borders cross rows of the image.
+    """Measurement model: image columns where the borders cross given rows.
 
     Args:
         ground: the camera with its mean pitch.
@@ -134,7 +134,7 @@ class BorderSensor(Sensor):
     variances: Float[Array, " n"]
 
     def expect(self, state: RoadState, measurement: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The columns, with lens, roll and the pitch of the state."""
+        """The expected columns, with lens, roll and the pitch of the state."""
         camera = state.camera(self.ground)
 
         def project(x: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Windows along predicted borders, sheared to their direction, and the sums along it."""
+"""Windows along predicted lane borders, sheared to the border's direction, and the sums along it."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from jaxloc.sensors.ground_camera import GroundCamera
 
 
 class Windows(eqx.Module):
-    """Where along each border the image is read.
+    """Layout of the measurement windows along the borders.
 
     Args:
         near: range of the first window, m.

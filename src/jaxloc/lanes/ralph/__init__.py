@@ -1,6 +1,6 @@
-"""RALPH: the lane by straightening the road under many hypotheses, and by what it looks like across."""
+"""RALPH: curvature by straightening the road under many hypotheses, offset by matching profiles with templates."""
 
-from jaxloc.lanes.ralph.estimate import LaneState, Trust, estimate
+from jaxloc.lanes.ralph.estimate import LaneState, LaneThresholds, estimate
 from jaxloc.lanes.ralph.match import Match, match_profile
 from jaxloc.lanes.ralph.profile import (
     AbsoluteSteps,
@@ -35,7 +35,7 @@ __all__ = [
     "Straightest",
     "Template",
     "TemplateResidual",
-    "Trust",
+    "LaneThresholds",
     "blend",
     "capture",
     "estimate",

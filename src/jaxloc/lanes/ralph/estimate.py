@@ -1,4 +1,4 @@
-"""RALPH in one call: sample, find the curvature, find the offset, and fit all of it."""
+"""RALPH in one call: curvature search, offset match, and joint fit."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ from jaxloc.solvers.robust_kernels import Loss
 
 
 class LaneState(eqx.Module):
-    """Where a vehicle is in its lane, by one image.
+    """Estimate of the vehicle's position in its lane from one image.
 
     Attributes:
         estimate: a `LaneFit` with its covariance, in the order offset, heading, curvature, pitch.
@@ -42,7 +42,7 @@ class LaneState(eqx.Module):
 
     @property
     def offset(self) -> Array:
-        """How far the vehicle is left of the lane's center, m."""
+        """Distance of the vehicle to the left of the lane's center, m."""
         return self.estimate.value.offset
 
     @property
@@ -57,17 +57,17 @@ class LaneState(eqx.Module):
 
     @property
     def ok(self) -> Array:
-        """Whether to believe it."""
+        """Whether the estimate is valid."""
         return self.estimate.ok
 
 
-class Trust(eqx.Module):
-    """When a lane is believed.
+class LaneThresholds(eqx.Module):
+    """Thresholds for a lane estimate to be valid.
 
     Args:
         correlation: least correlation of profile and template.
         rival: greatest correlation of another place, as a share of the best.
-        noise: greatest spread of what the fit leaves, of normalized rows.
+        noise: largest standard deviation of the residuals of normalized rows.
         move: greatest way of the fit's offset from where the profile matched, m.
     """
 
@@ -86,7 +86,7 @@ def estimate(
     pitch_sigma: Any = 0.01,
     sharpness: Sharpness = AbsoluteSteps(),
     kernel: Loss | None = None,
-    trust: Trust = Trust(),
+    thresholds: LaneThresholds = LaneThresholds(),
 ) -> LaneState:
     """Finds the lane in a view of the road [K-33].
 
@@ -97,14 +97,14 @@ def estimate(
     Args:
         view: the road from above.
         template: one, or a bank of them "b columns".
-        hypotheses: what to try; `Hypotheses.around` nothing by default.
+        hypotheses: search grid; `Hypotheses.around(None)` by default.
         pitch_sigma: how well the pitch of the view is known, rad.
         sharpness: measure of straightness.
         kernel: robust kernel of the fit; ``Tukey(10)`` by default.
-        trust: when to believe.
+        thresholds: thresholds for a valid lane.
 
     Returns:
-        The lane; ``ok`` is False for a road without features, one that looks like none of the templates, or one
+        The lane; ``ok`` is False for a road without features, one that matches none of the templates, or one
         whose profile repeats itself within reach.
 
     References:
@@ -117,11 +117,17 @@ def estimate(
     profile = straighten(view, rough, bank.left[0]).profile()
     match = match_profile(profile, bank, around=tried.offset, reach=tried.reach)
     chosen = jax.tree.map(lambda leaf: leaf[match.which], bank)
-    start = LaneFit(match.offset, rough.heading, rough.curvature, rough.pitch)
+    initial = LaneFit(match.offset, rough.heading, rough.curvature, rough.pitch)
     sigma = jnp.asarray(pitch_sigma, view.image.dtype)
-    fit = refine(view, chosen, start, pitch_sigma=sigma, kernel=kernel)
-    ambiguous = match.sidelobe > trust.rival * match.correlation
-    stayed = jnp.abs(fit.estimate.value.offset - match.offset) < trust.move
-    ok = fit.estimate.ok & stayed & (match.correlation > trust.correlation) & (fit.noise < trust.noise) & ~ambiguous
+    fit = refine(view, chosen, initial, pitch_sigma=sigma, kernel=kernel)
+    ambiguous = match.sidelobe > thresholds.rival * match.correlation
+    stayed = jnp.abs(fit.estimate.value.offset - match.offset) < thresholds.move
+    ok = (
+        fit.estimate.ok
+        & stayed
+        & (match.correlation > thresholds.correlation)
+        & (fit.noise < thresholds.noise)
+        & ~ambiguous
+    )
     result = eqx.tree_at(lambda e: e.ok, fit.estimate, ok)
     return LaneState(result, match.confidence(), ambiguous, match.which, match)

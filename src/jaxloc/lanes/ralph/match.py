@@ -1,4 +1,4 @@
-"""Where a profile lies in the templates: the lateral offset, and whether it could be somewhere else as well."""
+"""Lateral offset by correlation of a profile with templates, with a measure of ambiguity."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ _LEAST_OVERLAP = 0.5  # share of the template that must meet known parts of the 
 
 
 class Match(eqx.Module):
-    """A profile found in one of several templates.
+    """Best match of a profile among several templates.
 
     Attributes:
         offset: how far the vehicle is left of the lane's center, m.
@@ -34,7 +34,7 @@ class Match(eqx.Module):
     offsets: Float[Array, " s"]
 
     def confidence(self) -> Float[Array, ""]:
-        """How far the peak stands above the next one, 0 to 1: ``max(c, 0) (1 - max(s, 0) / c)``."""
+        """Peak height relative to the second peak, 0 to 1: ``max(c, 0) (1 - max(s, 0) / c)``."""
         peak = jnp.maximum(self.correlation, 0.0)
         return peak - jnp.clip(self.sidelobe, 0.0, peak)
 

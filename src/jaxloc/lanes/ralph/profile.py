@@ -17,13 +17,13 @@ _FEWEST = 0.4  # share of the positions of a row that must be seen for it to cou
 
 
 class LaneFit(eqx.Module):
-    """What the search and the fit move: a lane of constant curvature, and the camera's pitch.
+    """Parameters of the search and the fit: a lane of constant curvature, and the camera's pitch.
 
     Args:
         offset: how far the vehicle is left of the lane's center, m.
         heading: of the vehicle against the lane, counter-clockwise, rad.
         curvature: of the lane, positive to the left, 1/m.
-        pitch: how much further down the camera looks than its view was made with, rad.
+        pitch: pitch of the camera relative to that of the view, positive down, rad.
     """
 
     offset: Float[Array, ""]
@@ -44,8 +44,8 @@ class Straightened(eqx.Module):
 
     Attributes:
         values: normalized gray levels; row by range, column by lateral position in the lane; zero where not seen.
-        weight: 1 where they are seen, 0 where not, with a ramp between, so that nothing jumps as a lane moves; 0 in a
-            row that shows too little, or nothing but one gray level.
+        weight: 1 where visible, 0 where not, with a ramp between for continuity as a lane moves; 0 in a
+            row with too few visible samples, or with a single gray level.
     """
 
     values: Float[Array, "rows columns"]
@@ -90,7 +90,7 @@ def straighten(view: GroundView, fit: LaneFit, left: Float[Array, " columns"]) -
 def shift_rows(
     view: GroundView, fit: LaneFit, left: Float[Array, " columns"]
 ) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
-    """Gray levels of a view at lateral positions in the lane (cubic along rows), and the weight of what is seen."""
+    """Gray levels of a view at lateral positions in the lane (cubic along rows), and weights of visible samples."""
     ahead, scale = view.true_range(fit.pitch)
     center = fit.lane().center(ahead)
     column = view.grid.column((left[None, :] + center[:, None]) / scale[:, None])
@@ -110,13 +110,13 @@ def shift_rows(
 
 
 def _safe_columns(seen: Bool[Array, "rows columns"]) -> Bool[Array, "rows columns"]:
-    """Positions two columns within what is seen: all that cubic interpolation beside them looks at."""
+    """Positions two columns within what is seen: the support of cubic interpolation."""
     padded = jnp.pad(seen, ((0, 0), (2, 2)))
     return jnp.all(jnp.stack([padded[:, i : i + seen.shape[1]] for i in range(5)]), axis=0)
 
 
 def normalize_rows(values: Float[Array, "rows columns"], weight: Float[Array, "rows columns"]) -> Straightened:
-    """Zero mean and unit variance of what is seen in each row: a shadow across the road changes nothing."""
+    """Rows normalized to zero mean and unit variance over visible samples, which cancels shadows across the road."""
     count = jnp.sum(weight, axis=1, keepdims=True)
     some = jnp.maximum(count, 1.0)
     centered = values - jnp.sum(weight * values, axis=1, keepdims=True) / some
@@ -129,7 +129,7 @@ def normalize_rows(values: Float[Array, "rows columns"], weight: Float[Array, "r
 
 
 class Sharpness(eqx.Module):
-    """How straight a straightened view is: the sharper its profile, the straighter [K-37]."""
+    """Straightness score of a straightened view (strategy): a sharper profile is straighter [K-37]."""
 
     @abstractmethod
     def score(self, profile: Profile) -> Float[Array, ""]:
@@ -137,7 +137,7 @@ class Sharpness(eqx.Module):
 
 
 class AbsoluteSteps(Sharpness):
-    """RALPH's own measure: the sum of absolute differences of neighbors, ``sum |P[i+1] - P[i]|``."""
+    """The measure of the RALPH paper: the sum of absolute differences of neighbors, ``sum |P[i+1] - P[i]|``."""
 
     def score(self, profile: Profile) -> Float[Array, ""]:
         """The higher, the straighter."""
@@ -169,7 +169,7 @@ def _steps(profile: Profile) -> Float[Array, " c"]:
 
 @eqx.filter_jit
 def straightness(view: GroundView, fit: LaneFit, *, sharpness: Sharpness = AbsoluteSteps()) -> Float[Array, ""]:
-    """How straight the road becomes under a hypothesis: map it over many by ``jax.vmap`` [K-36], [K-37].
+    """Straightness of the road under one hypothesis; for many, use ``jax.vmap`` [K-36], [K-37].
 
     Args:
         view: the road from above.

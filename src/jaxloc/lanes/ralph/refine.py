@@ -1,4 +1,4 @@
-"""The joint fit of offset, heading, curvature and pitch to a template, and how far it may be trusted."""
+"""Joint least-squares fit of offset, heading, curvature and pitch to a template, with covariance."""
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from jaxloc.solvers.least_squares import minimize
 from jaxloc.solvers.problem import Problem
 from jaxloc.solvers.robust_kernels import Loss, Quadratic, Tukey
 
-_LEVELS = 3  # resolutions: a mark is wider than the error of the start at the coarsest
+_LEVELS = 3  # resolutions: a mark is wider than the initial error at the coarsest
 _ROUGH_STEPS = 20
 _STEPS = 100
 _STRETCHES = 4
@@ -26,15 +26,15 @@ _SMALLEST_NOISE = 0.02  # of a normalized row
 
 
 class TemplateResidual(Problem):
-    """Rows of a straightened view against a template, each with its own gain and bias taken out.
+    """Least-squares problem: rows of a straightened view against a template, with gain and bias removed per row.
 
     ``r_kn = (V_k(n) - T(n)) / s``, both normalized over the positions that row k shows; and the pitch against what is
     known of it, ``pitch / sigma``.
 
     Args:
         view: the road from above.
-        template: what it should look like across.
-        noise: s, spread of the difference of normalized rows.
+        template: the expected cross profile.
+        noise: s, standard deviation of the difference of normalized rows.
         pitch_sigma: how well the pitch of the view is known, rad.
         loss: robust kernel of a single position, since dashes, cars and shadows are not in the template; and those of
             what is not seen and of the pitch.
@@ -47,7 +47,7 @@ class TemplateResidual(Problem):
     loss: tuple[Loss, Loss, Loss]
 
     def residual(self, state: LaneFit) -> tuple[Array, Array, Array]:
-        """Whitened differences, what is not seen, and the pitch; one component by item."""
+        """Whitened gray-level differences, and the prior on the pitch; one component per item."""
         difference, weight = self.differences(state)
         # Looking away must not pay: a position that is not seen costs what one that fits costs.
         missing = 1.0 - weight
@@ -55,7 +55,7 @@ class TemplateResidual(Problem):
         return (difference / self.noise).reshape(1, -1), missing.reshape(1, -1), pitch.reshape(1, 1)
 
     def differences(self, state: LaneFit) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
-        """Normalized rows less the template, times their weight, and the weight: zero where either is unknown."""
+        """Weighted differences of normalized rows and template, and their weights: zero where either is unknown."""
         values, weight = shift_rows(self.view, state, self.template.left)
         rows = normalize_rows(values, jnp.where(self.template.known[None, :], weight, 0.0))
         model = normalize_rows(jnp.broadcast_to(self.template.values, values.shape), rows.weight)
@@ -67,7 +67,7 @@ class Refined(eqx.Module):
 
     Attributes:
         estimate: its `LaneFit`, with covariance.
-        noise: spread of the differences that were left, of normalized rows: 0 is a perfect likeness, 1.4 none.
+        noise: standard deviation of the residuals of normalized rows: 0 for a perfect match, 1.4 for none.
     """
 
     estimate: Estimate
@@ -77,7 +77,7 @@ class Refined(eqx.Module):
 def refine(
     view: GroundView,
     template: Template,
-    start: LaneFit,
+    initial: LaneFit,
     *,
     pitch_sigma: Float[Array, ""],
     kernel: Loss | None = None,
@@ -87,8 +87,8 @@ def refine(
 
     Args:
         view: the road from above.
-        template: what it looks like across.
-        start: where to begin, near enough for the marks to overlap.
+        template: its cross profile.
+        initial: initial value, close enough for the marks to overlap.
         pitch_sigma: how well the pitch of the view is known, rad.
         kernel: robust kernel; ``Tukey(10)`` by default, wide enough that a mark half beside its place still pulls.
         solver: of the last, finest fit. Its tolerance is by the cost, which ten thousand noisy positions make large: a
@@ -103,28 +103,28 @@ def refine(
         views.append(views[-1].coarser())
         templates.append(templates[-1].coarser())
     for level in range(_LEVELS - 1, 0, -1):
-        rough = _problem(views[level], templates[level], start, pitch_sigma, kernel)
-        start = minimize(rough, lax.stop_gradient(start), LevenbergMarquardt(rtol=1e-3), _ROUGH_STEPS)[0]
-    start = lax.stop_gradient(start)
-    problem = _problem(view, template, start, pitch_sigma, kernel)
-    found = solve(problem, start, solver=solver, max_steps=_STEPS)
+        rough = _problem(views[level], templates[level], initial, pitch_sigma, kernel)
+        initial = minimize(rough, lax.stop_gradient(initial), LevenbergMarquardt(rtol=1e-3), _ROUGH_STEPS)[0]
+    initial = lax.stop_gradient(initial)
+    problem = _problem(view, template, initial, pitch_sigma, kernel)
+    found = solve(problem, initial, solver=solver, max_steps=_STEPS)
     covariance = jnp.where(found.ok, _jackknife(problem, found.value), found.covariance)
     estimate = eqx.tree_at(lambda e: e.covariance, found, covariance)
-    return Refined(estimate, _spread(problem, found.value))
+    return Refined(estimate, _noise_level(problem, found.value))
 
 
 def _problem(
-    view: GroundView, template: Template, start: LaneFit, pitch_sigma: Float[Array, ""], kernel: Loss
+    view: GroundView, template: Template, initial: LaneFit, pitch_sigma: Float[Array, ""], kernel: Loss
 ) -> TemplateResidual:
-    """The problem with the noise that its start shows."""
+    """The problem with the noise level at the initial value."""
     problem = TemplateResidual(
         view, template, jnp.ones_like(pitch_sigma), pitch_sigma, (kernel, Quadratic(), Quadratic())
     )
-    return eqx.tree_at(lambda p: p.noise, problem, lax.stop_gradient(_spread(problem, start)))
+    return eqx.tree_at(lambda p: p.noise, problem, lax.stop_gradient(_noise_level(problem, initial)))
 
 
-def _spread(problem: TemplateResidual, state: LaneFit) -> Float[Array, ""]:
-    """Standard deviation of the differences as their mean absolute value tells it: few large ones do not matter."""
+def _noise_level(problem: TemplateResidual, state: LaneFit) -> Float[Array, ""]:
+    """Standard deviation of the differences from their mean absolute value, robust to a few large ones."""
     difference, _ = problem.differences(state)
     count = jnp.maximum(jnp.sum(difference != 0.0), 1).astype(difference.dtype)
     return jnp.maximum(1.2533 * jnp.sum(jnp.abs(difference)) / count, _SMALLEST_NOISE)

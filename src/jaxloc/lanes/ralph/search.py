@@ -1,4 +1,4 @@
-"""The exhaustive search: straighten the road under every hypothesis and keep the straightest."""
+"""Exhaustive search over curvature, heading and pitch hypotheses for the straightest road."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ _LEVEL = 2  # how often the view is halved first: the answer is refined
 
 
 class Hypotheses(eqx.Module):
-    """What is tried: all combinations of curvatures, headings and pitches, then offsets about a prediction.
+    """Search grid: all combinations of curvatures, headings and pitches.
 
     Args:
         curvatures: 1/m.
@@ -41,7 +41,7 @@ class Hypotheses(eqx.Module):
         offset: Any = 1.5,
         counts: tuple[int, int, int] = (41, 25, 5),
     ) -> "Hypotheses":
-        """Evenly spaced hypotheses about a prediction; the defaults suit a start from nothing on a fast road.
+        """Evenly spaced hypotheses around a prediction; the defaults suit a search without one on a fast road.
 
         Args:
             fit: prediction; straight on by default.
@@ -64,7 +64,7 @@ class Hypotheses(eqx.Module):
 
 
 class Straightest(eqx.Module):
-    """What the search found.
+    """Result of the search.
 
     Attributes:
         fit: best hypothesis, with offset zero.
@@ -81,7 +81,7 @@ class Straightest(eqx.Module):
 def find_straightest(
     view: GroundView, hypotheses: Hypotheses, *, sharpness: Sharpness = AbsoluteSteps()
 ) -> Straightest:
-    """Tries all hypotheses and keeps the one whose summed profile is sharpest [K-33], [K-36].
+    """Evaluates all hypotheses and keeps the one with the sharpest summed profile [K-33], [K-36].
 
     Each pitch makes one view with its own ranges. In it a hypothesis is a slice of every row at its own place, so that
     a thousand of them cost some milliseconds.
@@ -132,10 +132,10 @@ def _scores_at(view: GroundView, hypotheses: Hypotheses, pitch: Array, sharpness
 
 
 def _sum_slices(level: Float[Array, "rows columns"], shift: Float[Array, " rows"]) -> Profile:
-    """Mean of the rows, each read from its own shift on: one slice and one fraction a row; nothing beyond the view."""
+    """Mean of the rows, each read from its own shift on: one slice and one fraction per row; zero beyond the view."""
     rows, columns = level.shape
     padded = jnp.pad(level, ((0, 0), (columns, columns + 1)))
-    # Beyond its width a row has nothing to show.
+    # Samples beyond the width of a row are masked.
     place = jnp.clip(jnp.where(jnp.isfinite(shift), shift, 0.0), -columns, columns)
     first = jnp.floor(place)
     fraction = (place - first)[:, None]

@@ -1,4 +1,4 @@
-"""What the road looks like across: templates that are saved, blended in slowly, or taken from far ahead."""
+"""Templates of the road's cross profile: fixed, blended slowly, or captured from far rows."""
 
 from abc import abstractmethod
 from typing import Any
@@ -38,7 +38,7 @@ class Template(eqx.Module):
 def capture(
     view: GroundView, fit: LaneFit, *, near: Any = 0.0, far: Any = 1e6, left: Float[Array, " columns"] | None = None
 ) -> Template:
-    """Takes the template from a view whose lane is known: RALPH's button [K-42], or its look ahead [K-44].
+    """Captures a template from a view with known lane: on demand [K-42], or from far rows [K-44].
 
     Args:
         view: the road from above.
@@ -67,7 +67,7 @@ def capture(
 
 
 def _standard(template: Template) -> Template:
-    """The same with zero mean and unit variance: the gain of a mean of rows tells how much they agree, no more."""
+    """The same with zero mean and unit variance: the gain of a mean of rows only reflects how well they agree."""
     share = template.known.astype(template.values.dtype)
     count = jnp.maximum(jnp.sum(share), 1.0)
     centered = jnp.where(template.known, template.values - jnp.sum(share * template.values) / count, 0.0)
@@ -78,7 +78,7 @@ def _standard(template: Template) -> Template:
 
 @eqx.filter_jit
 def blend(template: Template, fresh: Template, rate: Float[Array, ""]) -> Template:
-    """A template with a small share of what is seen now, ``(1 - rate) T + rate F`` where both are known [K-43].
+    """Exponential blend of a template with the current profile, ``(1 - rate) T + rate F`` [K-43].
 
     Args:
         template: so far.
@@ -92,7 +92,7 @@ def blend(template: Template, fresh: Template, rate: Float[Array, ""]) -> Templa
 
 
 class Adaptation(eqx.Module):
-    """How a template follows the road; a strategy."""
+    """Template adaptation (strategy)."""
 
     @abstractmethod
     def adapt(self, template: Template, view: GroundView, fit: LaneFit, ok: Bool[Array, ""]) -> Template:
@@ -102,13 +102,13 @@ class Adaptation(eqx.Module):
             template: that of this image.
             view: the road from above.
             fit: lane in it: the one that was found, or for a while the predicted one where none was, as on a road
-                whose looks change at once.
-            ok: whether to trust that; a template stays as it is otherwise.
+                whose appearance changes abruptly.
+            ok: whether to thresholds that; a template stays as it is otherwise.
         """
 
 
 class Fixed(Adaptation):
-    """Keeps the template that a person saved [K-42]."""
+    """No adaptation: keeps the captured template [K-42]."""
 
     def adapt(self, template: Template, view: GroundView, fit: LaneFit, ok: Bool[Array, ""]) -> Template:
         """The same template."""
@@ -116,7 +116,7 @@ class Fixed(Adaptation):
 
 
 class Blended(Adaptation):
-    """Blends in what is seen now by a small share [K-43].
+    """Exponential blending with the current profile [K-43].
 
     Args:
         rate: share by image, 0 to 1.
@@ -134,7 +134,7 @@ class Blended(Adaptation):
 
 
 class Predictive(Adaptation):
-    """Takes the template from the far rows: what will be below the vehicle, if the curvature goes on [K-44].
+    """Captures the template from far rows, which the vehicle reaches later if the curvature persists [K-44].
 
     Args:
         near: range from which on rows count, m.

@@ -1,4 +1,4 @@
-"""FastSLAM: particles over the path of a robot, and in each a small Kalman filter for every landmark.
+"""FastSLAM: a Rao-Blackwellized particle filter over the path, with a Kalman filter per landmark.
 
 Given the path, landmarks are independent of each other (Rao-Blackwell), so that a particle needs a 2x2 covariance for
 each instead of one over all: the cost is linear in landmarks, not quadratic, and each particle decides by itself which
@@ -10,11 +10,11 @@ References:
 """
 
 from jaxloc.slam.fast_slam.association import Association, Candidates, associate
-from jaxloc.slam.fast_slam.block_proposal import FromBlock
+from jaxloc.slam.fast_slam.block_proposal import BlockProposal
 from jaxloc.slam.fast_slam.descriptors import Appearance, Appearances, DescriptorFastSlam, DescriptorSlamState
 from jaxloc.slam.fast_slam.fast_slam import FastSlam, FastSlamInfo, trace_back
 from jaxloc.slam.fast_slam.landmark_filter import LandmarkFilter, Landmarks
-from jaxloc.slam.fast_slam.proposals import FromMotion, FromReading, PathProposal
+from jaxloc.slam.fast_slam.proposals import MeasurementProposal, MotionProposal, PathProposal
 from jaxloc.slam.fast_slam.state import FastSlamState
 
 __all__ = [
@@ -27,9 +27,9 @@ __all__ = [
     "FastSlam",
     "FastSlamInfo",
     "FastSlamState",
-    "FromBlock",
-    "FromMotion",
-    "FromReading",
+    "BlockProposal",
+    "MotionProposal",
+    "MeasurementProposal",
     "LandmarkFilter",
     "Landmarks",
     "PathProposal",

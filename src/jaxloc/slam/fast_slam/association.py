@@ -1,4 +1,4 @@
-"""Which landmark of its map a particle takes a reading for: by number, by where it lies, and by what it looks like."""
+"""Data association of one particle: by landmark number, by position gates, and by descriptor."""
 
 import math
 
@@ -13,7 +13,7 @@ from jaxloc.slam.fast_slam.landmark_filter import LIKELY, Landmarks
 
 
 class Candidates(eqx.Module):
-    """What is known of a reading's landmark before anyone asks where it lies: the same for all particles.
+    """Candidate landmarks of a reading by descriptor or number, the same for all particles.
 
     Attributes:
         alike: which rows of the map it may be.
@@ -30,14 +30,14 @@ class Candidates(eqx.Module):
 
     @staticmethod
     def anything(capacity: int, dtype: jnp.dtype) -> "Candidates":
-        """Of a reading that looks like any landmark; new is what lies outside the gates of all."""
-        nothing = jnp.full((), -jnp.inf, dtype)
+        """Candidates of a reading without descriptor: every landmark; new if outside all gates."""
+        none = jnp.full((), -jnp.inf, dtype)
         zeros = jnp.zeros(capacity, dtype)
-        return Candidates(jnp.ones(capacity, bool), zeros, nothing, jnp.full((), -1, jnp.int32))
+        return Candidates(jnp.ones(capacity, bool), zeros, none, jnp.full((), -1, jnp.int32))
 
 
 class Association(eqx.Module):
-    """What a particle takes a reading for.
+    """Association of a reading by one particle.
 
     Attributes:
         row: of its map; the capacity where a new landmark finds no room.
@@ -53,24 +53,24 @@ class Association(eqx.Module):
 def associate(
     known: Landmarks,
     residuals: Float[Array, "k 2"],
-    spreads: Float[Array, "k 2 2"],
+    covariances: Float[Array, "k 2 2"],
     number: Int[Array, ""],
     candidates: Candidates,
 ) -> Association:
-    """The landmark that a reading belongs to, as one particle sees it.
+    """Associates a reading with a landmark of one particle's map.
 
     A number that is not negative is taken at its word. Otherwise the reading belongs to the row that maximizes::
 
-        log N(residual_j; 0, spread_j) + log_ratio_j
+        log N(residual_j; 0, S_j) + log_ratio_j
 
-    among those that look alike and whose gate the reading lies in, unless there is none or a new landmark is likelier.
+    among the candidates and whose gate the reading lies in, unless there is none or a new landmark is likelier.
 
     Args:
         known: the particle's map.
         residuals: (range, bearing) measured less expected of each row, m and rad.
-        spreads: their covariances.
+        covariances: of the residuals.
         number: of the landmark, negative where it is not known.
-        candidates: what the reading looks like.
+        candidates: candidate landmarks of the reading.
 
     Returns:
         The association.
@@ -84,14 +84,14 @@ def associate(
         >>> from jaxloc.slam.fast_slam import Candidates, Landmarks, associate
         >>> known = Landmarks(jnp.zeros((3, 2)), jnp.zeros((3, 2, 2)), jnp.array([True, True, False]), jnp.ones(3, int))
         >>> residuals = jnp.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.0]])
-        >>> spreads = jnp.tile(0.01 * jnp.eye(2), (3, 1, 1))
+        >>> covariances = jnp.tile(0.01 * jnp.eye(2), (3, 1, 1))
         >>> alike = Candidates(jnp.array([False, True, True]), jnp.zeros(3), jnp.array(-9.0), jnp.array(-1))
-        >>> found = associate(known, residuals, spreads, jnp.array(-1), alike)
-        >>> int(found.row), bool(found.fresh)  # row 0 is nearer, but looks different
+        >>> found = associate(known, residuals, covariances, jnp.array(-1), alike)
+        >>> int(found.row), bool(found.fresh)  # row 0 is nearer, but has another descriptor
         (1, False)
     """
     capacity = known.seen.shape[0]
-    roots = jax.vmap(cholesky)(spreads)
+    roots = jax.vmap(cholesky)(covariances)
     squared = jnp.sum(jax.vmap(whiten)(roots, residuals) ** 2, axis=1)
     within = gate(squared, 2, LIKELY)
     allowed = known.seen & candidates.alike & within
@@ -106,9 +106,9 @@ def associate(
     return Association(row, within[inside], jnp.where(numbered, ~known.seen[inside], unlike))
 
 
-def log_density(residual: Float[Array, "2"], spread: Float[Array, "2 2"]) -> Float[Array, ""]:
-    """Of a residual that is normal about zero."""
-    root = cholesky(spread)
+def log_density(residual: Float[Array, "2"], covariance: Float[Array, "2 2"]) -> Float[Array, ""]:
+    """Log density of a zero-mean normal residual."""
+    root = cholesky(covariance)
     return _log_density(jnp.sum(whiten(root, residual) ** 2)[None], root[None])[0]
 
 

@@ -1,4 +1,4 @@
-"""Poses drawn a block of steps at a time: until then each particle carries pose and map as one normal density."""
+"""Block proposal: poses are drawn once per block of steps; in between each particle is an EKF-SLAM."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,14 +11,14 @@ from jaxloc.poses import retract
 from jaxloc.sensors.landmarks import RangeBearing, locate
 from jaxloc.slam.fast_slam.association import associate, log_density
 from jaxloc.slam.fast_slam.landmark_filter import LandmarkFilter, Landmarks, Prediction
-from jaxloc.slam.fast_slam.proposals import Explained, Look, Particle, PathProposal, Verdict
+from jaxloc.slam.fast_slam.proposals import Decision, Observation, Particle, ParticleUpdate, PathProposal
 
 
-class FromBlock(PathProposal):
-    """FastSLAM with poses that are drawn once in many steps, from the motion and all readings of these.
+class BlockProposal(PathProposal):
+    """Proposal that draws poses once per block, from the motion and all readings of the block.
 
-    Where readings come often and are coarse beside the motion between them, a pose drawn at each reading is drawn from
-    next to nothing: all but a few particles are then lost to noise that later readings contradict, and with them what
+    Where readings come often and are coarse beside the motion between them, the pose at each reading is drawn from
+    poorly informed densities: most particles are then lost to noise that later readings contradict, and with them what
     was known of the path. Here nothing is drawn for a block of steps. Each particle meanwhile carries the joint
     covariance C of its pose and map, as EKF-SLAM does, beside the covariances P_j of its landmarks given the path. The
     difference is what the path alone makes uncertain::
@@ -26,8 +26,8 @@ class FromBlock(PathProposal):
         C = blockdiag(0, P_1, ..., P_k) + B,     B = cov(E[pose, map | path])
 
     At the end of a block that part is drawn, for the pose and all landmarks at once, and landmarks are again
-    independent given the path. With blocks of one step this is `FromReading` to first order; a block as long as the
-    drive makes each particle an EKF-SLAM. A step costs O(k^2) a particle, where the other proposals cost O(k).
+    independent given the path. With blocks of one step this is `MeasurementProposal` to first order; a block as long
+    as the drive makes each particle an EKF-SLAM. A step costs O(k^2) a particle, where the other proposals cost O(k).
 
     Under `jax.vmap` over several drives the draw is computed at each step, and kept at few: prefer `jax.lax.map`.
 
@@ -46,7 +46,7 @@ class FromBlock(PathProposal):
     Example:
         >>> import jax, jax.numpy as jnp, jaxloc as jl
         >>> slam = jl.slam.FastSlam(jl.sensors.IncrementMotion(), 0.1, 0.02, num_particles=10, capacity=4,
-        ...     proposal=jl.slam.fast_slam.FromBlock(50))
+        ...     proposal=jl.slam.fast_slam.BlockProposal(50))
         >>> slam.init(jl.beliefs.Gaussian(jl.poses.SE2(0.0, 0.0, 0.0), 1e-6 * jnp.eye(3))).pending.shape
         (10, 11, 11)
     """
@@ -58,15 +58,15 @@ class FromBlock(PathProposal):
             raise ValueError(f"A block has at least one step, not {self.num_steps}.")
 
     def num_pending(self, capacity: int) -> int:
-        """The pose and two numbers for each landmark."""
+        """Size of the joint state of pose and landmarks."""
         return 3 + 2 * capacity
 
     def draws_now(self, step: Int[Array, ""]) -> Bool[Array, ""]:
-        """Between blocks."""
+        """Whether a block ends before this step."""
         return (step % self.num_steps == 0) & (step > 0)
 
     def draw(self, particle: Particle, normal: Float[Array, " d"]) -> Particle:
-        """Pose and map moved by one draw of what the path makes uncertain."""
+        """Draws the pose, and moves the map by what is correlated with it."""
         known = particle.known
         given = _of_map(known)
         scale = jnp.sqrt(jnp.maximum(jnp.diagonal(particle.pending), float(jnp.finfo(given.dtype).tiny) ** 0.5))
@@ -80,21 +80,21 @@ class FromBlock(PathProposal):
         moved = Landmarks(means, known.covariances, known.seen, known.support)
         return Particle(retract(particle.pose, move[:3]), given, moved)
 
-    def explain(
-        self, landmarks: LandmarkFilter, particle: Particle, look: Look, normal: Float[Array, " d"]
-    ) -> Explained:
-        """A step of EKF-SLAM for the means and the joint covariance, one of FastSLAM for the landmarks' own."""
+    def update_particle(
+        self, landmarks: LandmarkFilter, particle: Particle, observation: Observation, normal: Float[Array, " d"]
+    ) -> ParticleUpdate:
+        """One EKF-SLAM update of means and joint covariance, one FastSLAM update of the landmarks' own covariances."""
         del normal
-        known, reading = particle.known, look.reading
+        known, reading = particle.known, observation.reading
         each = landmarks.predict_all(particle.pose, known, reading)
-        full = _spreads(each, particle.pending, landmarks.deviations)
-        found = associate(known, each.residual, full, reading.landmark, look.candidates)
+        full = _innovation_covariances(each, particle.pending, landmarks.deviations)
+        found = associate(known, each.residual, full, reading.landmark, observation.candidates)
         row = jnp.minimum(found.row, known.seen.shape[0] - 1)
-        one = Prediction(each.residual[row], each.by_pose[row], each.by_landmark[row], each.spread[row])
+        one = Prediction(each.residual[row], each.by_pose[row], each.by_landmark[row], each.covariance[row])
         corrected = _correct(landmarks, particle, row, one, full[row])
         choices = _add(landmarks, particle, row, reading), corrected, particle
         densities = log_density(one.residual, full[row]), landmarks.log_floor()
-        return Verdict.of(found, known).conclude(choices, look, found, densities)
+        return Decision.of(found, known).conclude(choices, observation, found, densities)
 
 
 def _of_map(known: Landmarks) -> Float[Array, "d d"]:
@@ -104,7 +104,9 @@ def _of_map(known: Landmarks) -> Float[Array, "d d"]:
     return jnp.zeros((3 + 2 * count, 3 + 2 * count), dtype).at[3:, 3:].set(own.reshape(2 * count, 2 * count))
 
 
-def _spreads(each: Prediction, pending: Float[Array, "d d"], deviations: Float[Array, "2"]) -> Float[Array, "k 2 2"]:
+def _innovation_covariances(
+    each: Prediction, pending: Float[Array, "d d"], deviations: Float[Array, "2"]
+) -> Float[Array, "k 2 2"]:
     """Covariance of the residual of each row by pose and landmark together."""
     count = each.residual.shape[0]
     rows = pending[3:].reshape(count, 2, -1)
@@ -117,12 +119,12 @@ def _spreads(each: Prediction, pending: Float[Array, "d d"], deviations: Float[A
 
 
 def _correct(
-    landmarks: LandmarkFilter, particle: Particle, row: Array, seen: Prediction, spread: Float[Array, "2 2"]
+    landmarks: LandmarkFilter, particle: Particle, row: Array, seen: Prediction, covariance: Float[Array, "2 2"]
 ) -> Particle:
     known, pending = particle.known, particle.pending
     rows = lax.dynamic_slice_in_dim(pending, 3 + 2 * row, 2, axis=0)
     image = matmul(seen.by_pose, pending[:3]) + matmul(seen.by_landmark, rows)
-    gain = solve(cholesky(spread), image).T
+    gain = solve(cholesky(covariance), image).T
     left = pending - matmul(gain, image)
     column = lax.dynamic_slice_in_dim(left, 3 + 2 * row, 2, axis=1)
     back = matmul(left[:, :3], seen.by_pose.T) + matmul(column, seen.by_landmark.T)

@@ -1,7 +1,7 @@
-"""Landmarks without numbers: a descriptor says which ones a reading may be of, and its place which one of those it is.
+"""FastSLAM with landmarks identified by descriptors and position, without landmark numbers.
 
 All particles share the descriptors, so that a reading is compared with each once. A landmark enters a row that no
-particle uses: a row means the same landmark in all of them, and is free again when the last particle that believed
+particle uses: a row means the same landmark in all of them, and is free again when the last particle that used
 in it is gone.
 """
 
@@ -21,15 +21,17 @@ from jaxloc.slam.fast_slam.state import FastSlamState
 
 
 class Appearance(eqx.Module):
-    """How alike two descriptors of one landmark are.
+    """Descriptor model: distribution of the distance between two descriptors of one landmark.
 
-    There is no ratio test: of two landmarks that look the same it would keep neither, and here their places decide.
+    There is no ratio test: of two landmarks with equal descriptors it would keep neither, while here their positions
+    decide.
 
     Args:
         deviation: standard deviation of their distance, in units of the descriptor.
         reach: the distance beyond which they are not of one landmark; None for three deviations.
-        new_density: of readings of new landmarks that look like a known one, per meter and radian: how often there is
-            one, over the area where it may lie. None for one in a thousand of the density at a perfectly known one.
+        new_density: density of readings of new landmarks whose descriptor matches a known one, per meter and radian: how
+            often there is one, over the area where it may lie. None for one in a thousand of the density at a perfectly
+            known one.
 
     Example:
         >>> import jax.numpy as jnp
@@ -51,17 +53,17 @@ class Appearance(eqx.Module):
     def compare(
         self, known: Float[Array, "k d"], descriptor: Float[Array, " d"]
     ) -> tuple[Bool[Array, " k"], Float[Array, " k"]]:
-        """Which rows a descriptor may belong to, and the log likelihood of each over that of equal looks."""
+        """Candidate landmarks of a descriptor, and their log-likelihood ratios."""
         squared = jnp.sum((known - descriptor[None]) ** 2, axis=1)
         alike = squared <= self.reach**2
         return alike, jnp.where(alike, -0.5 * jnp.where(alike, squared, 0.0) / self.deviation**2, 0.0)
 
 
 class Appearances(eqx.Module):
-    """What the landmarks look like, the same for all particles.
+    """Descriptors of the map, shared by all particles.
 
     Attributes:
-        descriptors: "k d", mean of the readings of each row, weighted as the particles believed in them.
+        descriptors: "k d", mean of the readings of each row, weighted by the particles that use them.
         readings: how many those are.
     """
 
@@ -69,7 +71,7 @@ class Appearances(eqx.Module):
     readings: Float[Array, " k"]
 
     def include(self, descriptor: Float[Array, " d"], shares: Float[Array, " k"]) -> "Appearances":
-        """With one more descriptor, of which each row has a share."""
+        """The map's descriptors updated by one more, with a weight per landmark."""
         readings = self.readings + shares
         gains = jnp.where(shares > 0.0, shares / jnp.where(shares > 0.0, readings, 1.0), 0.0)
         blend = (1.0 - gains)[:, None] * self.descriptors + gains[:, None] * descriptor[None]
@@ -77,7 +79,7 @@ class Appearances(eqx.Module):
 
 
 class DescriptorSlamState(FilterState):
-    """Particles of paths and maps, and what the landmarks look like.
+    """State of `DescriptorFastSlam`: particles of paths and maps, and the descriptors of the landmarks.
 
     Attributes:
         slam: poses and maps.
@@ -89,22 +91,22 @@ class DescriptorSlamState(FilterState):
 
     @property
     def step(self) -> Int[Array, ""]:
-        """How many predictions led here."""
+        """Number of predictions so far."""
         return self.slam.step
 
     def gaussian(self) -> Gaussian:
-        """The pose as a density: mean and spread of the particles."""
+        """Gaussian of the pose: mean and covariance of the particles."""
         return self.slam.gaussian()
 
     def landmarks(self) -> Float[Array, "k 2"]:
-        """The map of the best particle, m."""
+        """Landmark positions of the particle with the largest weight, m."""
         return self.slam.landmarks()
 
 
 class DescriptorFastSlam(Filter):
-    """`FastSlam` with landmarks that are known by what they look like, as with SIFT features.
+    """`FastSlam` with landmarks identified by descriptors, such as SIFT.
 
-    Each particle takes a reading for the landmark of its map that looks alike, lies within the gate and is the
+    Each particle takes a reading for the landmark of its map whose descriptor matches, lies within the gate and is the
     likeliest by both, or for a new one. Readings that have a number keep it.
 
     Attributes:
@@ -123,8 +125,8 @@ class DescriptorFastSlam(Filter):
         >>> filt = DescriptorFastSlam(slam, Appearance(0.1), length=2)
         >>> state = filt.init(jl.beliefs.Gaussian(jl.poses.SE2(0.0, 0.0, 0.0), 1e-6 * jnp.eye(3)))
         >>> reading = jl.sensors.RangeBearing(jnp.array(5.0), jl.poses.SO2.identity(), jnp.array(-1))
-        >>> for looks in ([0.0, 1.0], [1.0, 0.0], [0.0, 1.0]):  # at one place, by turns
-        ...     seen = jl.sensors.DescribedReading(reading, jnp.array(looks))
+        >>> for descriptor in ([0.0, 1.0], [1.0, 0.0], [0.0, 1.0]):  # at one place, by turns
+        ...     seen = jl.sensors.DescribedReading(reading, jnp.array(descriptor))
         ...     state, info = filt.update(state, seen, jnp.array(True), key=jax.random.key(0))
         >>> state.slam.maps.support[0].tolist()
         [2, 1, 0, 0]
@@ -135,17 +137,17 @@ class DescriptorFastSlam(Filter):
     length: int = eqx.field(static=True)
 
     def init(self, prior: Gaussian) -> DescriptorSlamState:
-        """Particles at the mean of a density of the pose, and no landmarks."""
+        """Initial state: particles at the mean of the prior, and an empty map."""
         slam, dtype = self.slam.init(prior), prior.covariance.dtype
         capacity = self.slam.capacity
-        nothing = Appearances(jnp.zeros((capacity, self.length), dtype), jnp.zeros(capacity, dtype))
-        return DescriptorSlamState(slam, nothing)
+        none = Appearances(jnp.zeros((capacity, self.length), dtype), jnp.zeros(capacity, dtype))
+        return DescriptorSlamState(slam, none)
 
     @eqx.filter_jit
     def predict(
         self, state: DescriptorSlamState, control: Any, *, key: Key[Array, ""] | None = None
     ) -> DescriptorSlamState:
-        """Every particle moves."""
+        """Predicts all particles."""
         return DescriptorSlamState(self.slam.predict(state.slam, control, key=key), state.appearances)
 
     @eqx.filter_jit
@@ -157,7 +159,7 @@ class DescriptorFastSlam(Filter):
         *,
         key: Key[Array, ""] | None = None,
     ) -> tuple[DescriptorSlamState, FastSlamInfo]:
-        """One reading, as in `FastSlam.update`; one whose descriptor has bad numbers changes nothing.
+        """Updates by one reading, as `FastSlam.update`; one with a non-finite descriptor is ignored.
 
         Raises:
             ValueError: without a key, or with descriptors of another length.

@@ -1,4 +1,4 @@
-"""The filter itself: a reading draws poses, corrects maps and multiplies weights; at times particles are drawn anew."""
+"""FastSLAM filter: predict, update and resampling."""
 
 import math
 from typing import Any
@@ -18,12 +18,12 @@ from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.landmarks import RangeBearing, sanitize
 from jaxloc.slam.fast_slam.association import Candidates
 from jaxloc.slam.fast_slam.landmark_filter import LandmarkFilter, Landmarks
-from jaxloc.slam.fast_slam.proposals import FromReading, Look, Particle, PathProposal
+from jaxloc.slam.fast_slam.proposals import MeasurementProposal, Observation, Particle, PathProposal
 from jaxloc.slam.fast_slam.state import FastSlamState
 
 
 class FastSlamInfo(Info):
-    """What an update of `FastSlam` says.
+    """Information about an update of `FastSlam`.
 
     Attributes:
         log_likelihood: of the reading given all earlier ones.
@@ -44,7 +44,7 @@ class FastSlamInfo(Info):
 
 
 class FastSlam(Filter):
-    """Localization and mapping with range and bearing of landmarks, by Rao-Blackwellized particles.
+    """FastSLAM with range-bearing landmarks, versions 1 and 2 by choice of the proposal.
 
     A reading with a landmark's number updates that row of each particle's map; with -1 each particle takes it for the
     landmark that explains it best within the gate, or for a new one. A reading outside the gate of a known landmark
@@ -55,7 +55,7 @@ class FastSlam(Filter):
         motion: of the robot.
         deviations: standard deviations of range (m) and bearing (rad).
         mount: T_robot_sensor.
-        proposal: `FromMotion`, `FromReading` or `FromBlock`.
+        proposal: `MotionProposal`, `MeasurementProposal` or `BlockProposal`.
         num_particles: how many.
         capacity: rows of a map.
         ess_threshold: fraction of the particles below which the effective number triggers resampling.
@@ -77,7 +77,7 @@ class FastSlam(Filter):
         *,
         num_particles: int,
         capacity: int,
-        proposal: PathProposal = FromReading(),
+        proposal: PathProposal = MeasurementProposal(),
         mount: Any = None,
         ess_threshold: float = 0.5,
     ):
@@ -89,11 +89,11 @@ class FastSlam(Filter):
 
     @property
     def landmark_filter(self) -> LandmarkFilter:
-        """That of each row of a map."""
+        """The Kalman filter of each landmark."""
         return LandmarkFilter(self.deviations, self.mount)
 
     def init(self, prior: Gaussian) -> FastSlamState:
-        """Particles at the mean of a density of the pose; its spread is drawn with the first reading."""
+        """Initial state: particles at the mean of the prior; its covariance is sampled at the first reading."""
         n, dtype, size = self.num_particles, prior.covariance.dtype, self.proposal.num_pending(self.capacity)
         pending = jnp.zeros((size, size), dtype).at[:3, :3].set(prior.covariance)
         one = (prior.mean, pending, Landmarks.empty(self.capacity, dtype))
@@ -103,7 +103,7 @@ class FastSlam(Filter):
 
     @eqx.filter_jit
     def predict(self, state: FastSlamState, control: Any, *, key: Key[Array, ""] | None = None) -> FastSlamState:
-        """Every particle moves; its noise stays pending until a reading can say something about it.
+        """Predicts all particles; the motion noise stays pending until the next reading.
 
         Raises:
             ValueError: without a key, where the proposal draws between readings.
@@ -134,7 +134,7 @@ class FastSlam(Filter):
         *,
         key: Key[Array, ""] | None = None,
     ) -> tuple[FastSlamState, FastSlamInfo]:
-        """One reading: poses are drawn, landmarks corrected or added, weights multiplied, and particles resampled.
+        """Updates by one reading: draws poses, corrects or adds landmarks, weighs and resamples particles.
 
         Raises:
             ValueError: without a key.
@@ -151,7 +151,7 @@ class FastSlam(Filter):
         *,
         key: Key[Array, ""] | None = None,
     ) -> tuple[FastSlamState, FastSlamInfo]:
-        """`update` by a reading of which is known what it looks like.
+        """`update` by a reading with given candidate landmarks.
 
         Raises:
             ValueError: without a key.
@@ -161,9 +161,12 @@ class FastSlam(Filter):
         key_draw, key_resample = jax.random.split(key)
         reading, usable = sanitize(measurement, valid & (measurement.landmark < self.capacity))
         normal = jax.random.normal(key_draw, state.pending.shape[:2], state.pending.dtype)
-        before, look = jax.vmap(Particle)(state.poses, state.pending, state.maps), Look(reading, candidates)
-        explain = jax.vmap(self.proposal.explain, in_axes=(None, 0, None, 0))
-        found = explain(self.landmark_filter, before, look, normal)
+        before, observation = (
+            jax.vmap(Particle)(state.poses, state.pending, state.maps),
+            Observation(reading, candidates),
+        )
+        update_particle = jax.vmap(self.proposal.update_particle, in_axes=(None, 0, None, 0))
+        found = update_particle(self.landmark_filter, before, observation, normal)
         joint = state.log_weights + found.log_density
         total = logsumexp(joint)
         fine = usable & jnp.isfinite(total)
@@ -188,11 +191,11 @@ class FastSlam(Filter):
 
 @eqx.filter_jit
 def trace_back(poses: SE2, ancestors: Int[Array, "t n"], particle: Int[Array, ""]) -> SE2:
-    """The path of one of the last particles, from the poses and ancestors of each update [R-18].
+    """Path of one of the final particles, from the poses and ancestors of each update [R-18].
 
     Args:
-        poses: of all particles after each update, stacked along steps and particles. With `FromBlock` they are means,
-            for the path within a block is not drawn.
+        poses: of all particles after each update, stacked along steps and particles. With `BlockProposal` they are
+            means, for the path within a block is not drawn.
         ancestors: `FastSlamInfo.ancestors` of each update.
         particle: index among the last particles.
 

@@ -1,4 +1,4 @@
-"""The map of one particle: a Kalman filter of two numbers for each landmark, given the path [R-20]."""
+"""Landmark filters of one particle: a planar Kalman filter per landmark, given the path [R-20]."""
 
 import math
 from typing import Any
@@ -33,29 +33,29 @@ class Landmarks(eqx.Module):
 
     @staticmethod
     def empty(capacity: int, dtype: Any) -> "Landmarks":
-        """A map of which nothing is known."""
+        """An empty map."""
         means, covariances = jnp.zeros((capacity, 2), dtype), jnp.zeros((capacity, 2, 2), dtype)
         return Landmarks(means, covariances, jnp.zeros(capacity, bool), jnp.zeros(capacity, jnp.int32))
 
 
 class Prediction(eqx.Module):
-    """A reading as expected of one landmark (or, stacked, of each).
+    """Predicted reading of one landmark, or stacked of all.
 
     Attributes:
         residual: (range, bearing) measured minus expected, m and rad.
         by_pose: its derivative by the pose (right perturbation).
         by_landmark: its derivative by the landmark, in the world.
-        spread: covariance of the residual given the pose.
+        covariance: of the residual given the pose.
     """
 
     residual: Float[Array, "2"]
     by_pose: Float[Array, "2 3"]
     by_landmark: Float[Array, "2 2"]
-    spread: Float[Array, "2 2"]
+    covariance: Float[Array, "2 2"]
 
 
 class LandmarkFilter(eqx.Module):
-    """What range and bearing say of a landmark from a known pose.
+    """Kalman filter of a landmark by range and bearing from a known pose.
 
     Attributes:
         deviations: standard deviations of range (m) and bearing (rad).
@@ -78,13 +78,13 @@ class LandmarkFilter(eqx.Module):
     mount: SE2
 
     def log_floor(self) -> Float[Array, ""]:
-        """Log density of what is no reading of a known landmark: as likely everywhere, whatever the particle."""
+        """Log density of a reading of no known landmark, uniform and equal for all particles."""
         return math.log1p(-LIKELY) - jnp.sum(jnp.log(self.deviations)) - math.log(2.0 * math.pi)
 
     def predict(
         self, pose: SE2, mean: Float[Array, "2"], covariance: Float[Array, "2 2"], reading: RangeBearing
     ) -> Prediction:
-        """What one landmark leads to expect of a reading from a pose T_world_robot."""
+        """Predicted reading of one landmark from a pose T_world_robot."""
         sensor = pose @ self.mount
         expected = observe(sensor, mean, reading.landmark)
         residual = jnp.concatenate([(reading.range - expected.range)[None], expected.bearing.local(reading.bearing)])
@@ -95,11 +95,11 @@ class LandmarkFilter(eqx.Module):
         lever = jnp.stack([inside[1], -inside[0]])
         moves = jnp.concatenate([-jnp.eye(2, dtype=mean.dtype), lever[:, None]], axis=1)
         by_pose = matmul(matmul(polar, self.mount.rotation.matrix().T), moves)
-        spread = matmul(matmul(by_landmark, covariance), by_landmark.T) + jnp.diag(self.deviations**2)
-        return Prediction(residual, by_pose, by_landmark, spread)
+        expected = matmul(matmul(by_landmark, covariance), by_landmark.T) + jnp.diag(self.deviations**2)
+        return Prediction(residual, by_pose, by_landmark, expected)
 
     def predict_all(self, pose: SE2, known: Landmarks, reading: RangeBearing) -> Prediction:
-        """`predict` of each row of a map, stacked."""
+        """Predicted readings of all landmarks, stacked."""
 
         def one(mean, covariance):
             return self.predict(pose, mean, covariance, reading)
@@ -107,9 +107,9 @@ class LandmarkFilter(eqx.Module):
         return jax.vmap(one)(known.means, known.covariances)
 
     def correct(self, known: Landmarks, row: Int[Array, ""], seen: Prediction) -> Landmarks:
-        """The map after a reading of one of its rows; unchanged by a row beyond its end."""
+        """The map corrected by a reading of one landmark; unchanged for an index beyond its end."""
         covariance = known.covariances[row]
-        gain = solve(cholesky(seen.spread), matmul(seen.by_landmark, covariance)).T
+        gain = solve(cholesky(seen.covariance), matmul(seen.by_landmark, covariance)).T
         rest = jnp.eye(2, dtype=gain.dtype) - matmul(gain, seen.by_landmark)
         joseph = matmul(matmul(rest, covariance), rest.T) + matmul(gain * self.deviations[None] ** 2, gain.T)
         means = known.means.at[row].add(matmul(gain, seen.residual), mode="drop")
@@ -117,7 +117,7 @@ class LandmarkFilter(eqx.Module):
         return Landmarks(means, covariances, known.seen, known.support)
 
     def add(self, known: Landmarks, row: Any, pose: SE2, reading: RangeBearing) -> Landmarks:
-        """The map with a landmark put where a reading says; unchanged by a row beyond its end."""
+        """The map with a landmark initialized from a reading; unchanged for an index beyond its end."""
         sensor = pose @ self.mount
         covariance = locate_covariance(sensor, reading, self.deviations)
         means = known.means.at[row].set(locate(sensor, reading), mode="drop")

@@ -1,4 +1,4 @@
-"""How a particle explains a reading, and from which density it draws its pose."""
+"""Proposal distributions of FastSLAM: from the motion (1.0), or from motion and reading (2.0)."""
 
 from abc import abstractmethod
 
@@ -16,11 +16,11 @@ from jaxloc.slam.fast_slam.landmark_filter import LandmarkFilter, Landmarks
 
 
 class Particle(eqx.Module):
-    """One particle.
+    """State of one particle.
 
     Attributes:
         pose: T_world_robot.
-        pending: covariance of what is not drawn yet: of the pose (right perturbation), and in a `FromBlock` of the
+        pending: covariance of what is not drawn yet: of the pose (right perturbation), and in a `BlockProposal` of the
             landmarks too.
         known: its map.
     """
@@ -30,15 +30,15 @@ class Particle(eqx.Module):
     known: Landmarks
 
 
-class Look(eqx.Module):
-    """A reading, and which landmarks look like it."""
+class Observation(eqx.Module):
+    """A reading and its candidate landmarks."""
 
     reading: RangeBearing
     candidates: Candidates
 
 
-class Explained(eqx.Module):
-    """A particle after a reading.
+class ParticleUpdate(eqx.Module):
+    """A particle after a reading: weight, association and pending density.
 
     Attributes:
         particle: with the reading.
@@ -52,11 +52,11 @@ class Explained(eqx.Module):
 
 
 class PathProposal(eqx.Module):
-    """From which density new poses are drawn, and when."""
+    """Proposal distribution of poses (strategy)."""
 
     @abstractmethod
     def num_pending(self, capacity: int) -> int:
-        """Size of `Particle.pending` beside a map of some capacity."""
+        """Size of `Particle.pending` for a map of given capacity."""
 
     @abstractmethod
     def draws_now(self, step: Int[Array, ""]) -> Bool[Array, ""] | None:
@@ -64,38 +64,17 @@ class PathProposal(eqx.Module):
 
     @abstractmethod
     def draw(self, particle: Particle, normal: Float[Array, " d"]) -> Particle:
-        """A particle with nothing pending."""
+        """Draws the pending density."""
 
     @abstractmethod
-    def explain(
-        self, landmarks: LandmarkFilter, particle: Particle, look: Look, normal: Float[Array, " d"]
-    ) -> Explained:
-        """A particle after a reading."""
+    def update_particle(
+        self, landmarks: LandmarkFilter, particle: Particle, observation: Observation, normal: Float[Array, " d"]
+    ) -> ParticleUpdate:
+        """A particle after a reading: weight, association and pending density."""
 
 
-class FromMotion(PathProposal):
-    """FastSLAM 1: poses are drawn from the motion alone, and the reading weighs them."""
-
-    def num_pending(self, capacity: int) -> int:
-        """The pose."""
-        return 3
-
-    def draws_now(self, step: Int[Array, ""]) -> None:
-        """Never: each reading draws."""
-
-    def draw(self, particle: Particle, normal: Float[Array, " d"]) -> Particle:
-        """As it is."""
-        return particle
-
-    def explain(
-        self, landmarks: LandmarkFilter, particle: Particle, look: Look, normal: Float[Array, " d"]
-    ) -> Explained:
-        """Nothing of the motion is corrected before the draw."""
-        return _draw_and_explain(landmarks, particle, look, normal, jnp.zeros_like(particle.pending))
-
-
-class FromReading(PathProposal):
-    """FastSLAM 2: poses are drawn from motion and reading together, so that a sharp sensor wastes no particles."""
+class MotionProposal(PathProposal):
+    """FastSLAM 1.0 proposal: poses are drawn from the motion model and weighted by the reading."""
 
     def num_pending(self, capacity: int) -> int:
         """The pose."""
@@ -105,23 +84,44 @@ class FromReading(PathProposal):
         """Never: each reading draws."""
 
     def draw(self, particle: Particle, normal: Float[Array, " d"]) -> Particle:
-        """As it is."""
+        """The particle unchanged."""
         return particle
 
-    def explain(
-        self, landmarks: LandmarkFilter, particle: Particle, look: Look, normal: Float[Array, " d"]
-    ) -> Explained:
-        """All of the motion is corrected before the draw."""
-        return _draw_and_explain(landmarks, particle, look, normal, particle.pending)
+    def update_particle(
+        self, landmarks: LandmarkFilter, particle: Particle, observation: Observation, normal: Float[Array, " d"]
+    ) -> ParticleUpdate:
+        """Draws the motion, then weighs it by the reading."""
+        return _draw_and_update(landmarks, particle, observation, normal, jnp.zeros_like(particle.pending))
 
 
-class Verdict(eqx.Module):
-    """What becomes of a reading.
+class MeasurementProposal(PathProposal):
+    """FastSLAM 2.0 proposal: poses are drawn from motion and reading together, for accurate sensors."""
+
+    def num_pending(self, capacity: int) -> int:
+        """The pose."""
+        return 3
+
+    def draws_now(self, step: Int[Array, ""]) -> None:
+        """Never: each reading draws."""
+
+    def draw(self, particle: Particle, normal: Float[Array, " d"]) -> Particle:
+        """The particle unchanged."""
+        return particle
+
+    def update_particle(
+        self, landmarks: LandmarkFilter, particle: Particle, observation: Observation, normal: Float[Array, " d"]
+    ) -> ParticleUpdate:
+        """Corrects the motion by the reading, then draws."""
+        return _draw_and_update(landmarks, particle, observation, normal, particle.pending)
+
+
+class Decision(eqx.Module):
+    """Decision about a reading: landmark added, corrected, or reading ignored.
 
     Attributes:
-        corrects: it corrects its landmark.
-        adds: it puts a landmark where it says, a new one or one that was contradicted too often.
-        support: of the map after it.
+        corrects: a known landmark is corrected.
+        adds: a landmark is initialized by it, a new one or one that was contradicted too often.
+        support: counters of the map after it.
     """
 
     corrects: Bool[Array, ""]
@@ -129,61 +129,61 @@ class Verdict(eqx.Module):
     support: Int[Array, " k"]
 
     @staticmethod
-    def of(found: Association, known: Landmarks) -> "Verdict":
-        """By what a particle takes a reading for."""
+    def of(found: Association, known: Landmarks) -> "Decision":
+        """Decision by the association."""
         corrects = found.near & ~found.fresh
         distrusted = ~found.near & ~found.fresh & (known.support[found.row] <= 0)
         adds = (found.fresh | distrusted) & (found.row < known.seen.shape[0])
         change = jnp.where(adds, 1 - known.support[found.row], jnp.where(found.near, 1, -1))
-        return Verdict(corrects, adds, known.support.at[found.row].add(change, mode="drop"))
+        return Decision(corrects, adds, known.support.at[found.row].add(change, mode="drop"))
 
     def conclude(
         self,
         choices: tuple[Particle, Particle, Particle],
-        look: Look,
+        observation: Observation,
         found: Association,
         densities: tuple[Array, Array],
-    ) -> Explained:
-        """One of three particles: with the landmark added, corrected, or as it is.
+    ) -> ParticleUpdate:
+        """Selects among the three updated particles.
 
         Args:
             choices: the three.
-            look: the reading.
+            observation: the reading.
             found: its landmark.
             densities: log density of a reading of a known landmark, and the least there is.
         """
         chosen = jax.tree.map(lambda a, b, c: jnp.where(self.adds, a, jnp.where(self.corrects, b, c)), *choices)
         chosen = eqx.tree_at(lambda particle: particle.known.support, chosen, self.support)
-        candidates = look.candidates
+        candidates = observation.candidates
         density = jnp.where(self.corrects, densities[0] + candidates.log_ratios[found.row], candidates.log_new)
         row = jnp.where(self.adds | self.corrects, found.row, -1)
-        return Explained(chosen, jnp.maximum(density, densities[1]), row)
+        return ParticleUpdate(chosen, jnp.maximum(density, densities[1]), row)
 
 
-def _draw_and_explain(
+def _draw_and_update(
     landmarks: LandmarkFilter,
     particle: Particle,
-    look: Look,
+    observation: Observation,
     normal: Float[Array, "3"],
     correctable: Float[Array, "3 3"],
-) -> Explained:
+) -> ParticleUpdate:
     """The pose is drawn, given the part of its covariance that the reading may correct; then its map is corrected."""
-    pose, pending, known, reading = particle.pose, particle.pending, particle.known, look.reading
+    pose, pending, known, reading = particle.pose, particle.pending, particle.known, observation.reading
     each = landmarks.predict_all(pose, known, reading)
-    full = each.spread + matmul(matmul(each.by_pose, pending), each.by_pose.mT)
-    found = associate(known, each.residual, full, reading.landmark, look.candidates)
-    verdict, row = Verdict.of(found, known), found.row
+    full = each.covariance + matmul(matmul(each.by_pose, pending), each.by_pose.mT)
+    found = associate(known, each.residual, full, reading.landmark, observation.candidates)
+    decision, row = Decision.of(found, known), found.row
     residual, jacobian = each.residual[row], each.by_pose[row]
-    prior = jnp.where(verdict.corrects, correctable, 0.0)
+    prior = jnp.where(decision.corrects, correctable, 0.0)
     gain = solve(cholesky(full[row]), matmul(jacobian, prior)).T
     rest = pending - matmul(gain, matmul(jacobian, prior))
     drawn = retract(pose, matmul(gain, residual) + matmul(cholesky(0.5 * (rest + rest.T)), normal))
-    # The reading as seen from the drawn pose.
+    # The predicted reading from the drawn pose.
     again = landmarks.predict(drawn, known.means[row], known.covariances[row], reading)
     early = jnp.any(prior != 0.0)
-    density = log_density(jnp.where(early, residual, again.residual), jnp.where(early, full[row], again.spread))
-    nothing = jnp.zeros_like(pending)
-    added = Particle(drawn, nothing, landmarks.add(known, row, drawn, reading))
-    corrected = Particle(drawn, nothing, landmarks.correct(known, row, again))
-    choices = added, corrected, Particle(drawn, nothing, known)
-    return verdict.conclude(choices, look, found, (density, landmarks.log_floor()))
+    density = log_density(jnp.where(early, residual, again.residual), jnp.where(early, full[row], again.covariance))
+    none = jnp.zeros_like(pending)
+    added = Particle(drawn, none, landmarks.add(known, row, drawn, reading))
+    corrected = Particle(drawn, none, landmarks.correct(known, row, again))
+    choices = added, corrected, Particle(drawn, none, known)
+    return decision.conclude(choices, observation, found, (density, landmarks.log_floor()))

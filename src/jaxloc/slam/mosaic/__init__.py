@@ -1,4 +1,4 @@
-"""Mosaics of floors: images laid side by side to a map, and a camera followed in it."""
+"""Floor mosaics: registration and blending of downward images, and camera tracking in the mosaic."""
 
 from jaxloc.slam.mosaic.blend import Exposure, balance, blend, enclose
 from jaxloc.slam.mosaic.features import FeaturePairs, Squares, feature_jacobian, pose_from_features, register_squares

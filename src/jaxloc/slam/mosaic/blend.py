@@ -1,4 +1,4 @@
-"""Many images of a floor made one: exposures balanced, bright middles of images counted most."""
+"""Blending of registered images into a mosaic, with exposure compensation."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ from jaxloc.solvers.cholesky import factor
 
 
 class Exposure(eqx.Module):
-    """How an image's gray levels follow from the floor's: ``image = gain floor + bias``; one, or a stack.
+    """Exposure of an image relative to the mosaic: ``image = gain floor + bias``; one, or a stack.
 
     Attributes:
         gain: contrast.
@@ -30,7 +30,7 @@ class Exposure(eqx.Module):
 
     @staticmethod
     def none(count: int, dtype: Any = float) -> "Exposure":
-        """Of images that need no change."""
+        """Identity exposures."""
         return Exposure(jnp.ones(count, dtype), jnp.zeros(count, dtype))
 
 
@@ -38,7 +38,7 @@ class Exposure(eqx.Module):
 def balance(
     first: Int[Array, " m"], second: Int[Array, " m"], overlaps: Overlap, valid: Bool[Array, " m"], *, count: int
 ) -> Exposure:
-    """Exposures of all images from what pairs of them show of the same floor.
+    """Estimates the exposures of all images from overlapping pairs.
 
     Gains by least squares of ``log(s_i / s_j) = log g_i - log g_j`` for the standard deviations s in the overlap, then
     biases likewise from the means; their mean over all images is fixed. Pairs count by their overlap.
@@ -65,8 +65,8 @@ def balance(
     """
     textured = valid & jnp.all(overlaps.deviations > 1e-3, axis=1)
     weight = jnp.where(textured, overlaps.share, 0.0)
-    spread = jnp.log(jnp.where(textured[:, None], overlaps.deviations, 1.0))
-    log_gain = _potentials(first, second, spread[:, 0] - spread[:, 1], weight, count)
+    log_contrast = jnp.log(jnp.where(textured[:, None], overlaps.deviations, 1.0))
+    log_gain = _potentials(first, second, log_contrast[:, 0] - log_contrast[:, 1], weight, count)
     gain = jnp.exp(log_gain)
     means = jnp.where(textured[:, None], overlaps.means, 0.0)
     level = _potentials(first, second, means[:, 0] / gain[first] - means[:, 1] / gain[second], weight, count)
@@ -84,7 +84,7 @@ def _potentials(first: Array, second: Array, difference: Array, weight: Array, c
 
 
 def enclose(poses: SE2, patch: Raster, *, margin: float = 0.0) -> Raster:
-    """The smallest upright raster that holds patches at given poses (host only: its size is a shape).
+    """Smallest axis-aligned raster that contains patches at given poses (host only: its size is a shape).
 
     Args:
         poses: stacked.
@@ -116,7 +116,7 @@ def blend(
     exposures: Exposure | None = None,
     used: Bool[Array, " n"] | None = None,
 ) -> Patch:
-    """Lays patches side by side and over each other: ``sum_k w_k (I_k - b_k) / g_k / sum_k w_k``.
+    """Weighted blending of patches: ``sum_k w_k (I_k - b_k) / g_k / sum_k w_k``.
 
     The weight is the vignetting's, so that the bright middles of images make the mosaic and no seam shows.
 

@@ -1,4 +1,4 @@
-"""Registration by features: squares of floor found again by correlation, and the pose that explains where they are."""
+"""Feature-based registration: squares found by correlation, and the pose from their positions."""
 
 from typing import Any
 
@@ -62,7 +62,7 @@ class FeaturePairs(Problem):
     loss: Any = Quadratic()
 
     def residual(self, state: SE2) -> Float[Array, "2 n"]:
-        """Differences in frame i, in sigmas."""
+        """Whitened differences in frame i."""
         predicted = matmul(state.rotation.matrix(), self.points_j) + state.translation[:, None]
         return jnp.where(self.valid[None], (predicted - self.points_i) / self.sigma[None], 0.0)
 
@@ -92,7 +92,7 @@ def pose_from_features(
     Args:
         points_i: "n 2", frame i, m.
         points_j: "n 2", frame j, m.
-        initial: guess of ``T_i_j``.
+        initial: initial value of ``T_i_j``.
         sigma: standard deviation of a pair's difference along each axis, m; one, or one a pair.
         valid: which pairs count; all by default.
         loss: robust kernel, in sigmas.
@@ -118,7 +118,7 @@ def pose_from_features(
 
 
 class Squares(eqx.Module):
-    """Which squares of floor are looked for, and how far about.
+    """Layout of the square templates and their search range.
 
     Attributes:
         size: edge of a square, px.
@@ -133,16 +133,16 @@ class Squares(eqx.Module):
 
 @eqx.filter_jit
 def register_squares(first: Patch, second: Patch, predicted: SE2, *, squares: Squares = Squares()) -> Estimate:
-    """The pose between two cameras over a floor by squares of the second patch, found again in the first.
+    """Estimates the pose between two cameras over a floor from squares of the second patch, matched in the first.
 
     The first patch is turned to the predicted heading; each square is searched in it by zero-mean correlation, whatever
-    the exposure; a robust fit of the pose tells which were found. It needs no better guess than `Squares.reach`, where
+    the exposure; a robust fit of the pose finds the inliers. The initial value may be off by `Squares.reach`, where
     the derivatives that `register` follows may lead nowhere; its result starts that one.
 
     Args:
         first: the reference.
         second: the piece that is laid upon it; of the same resolution.
-        predicted: guess of ``T_first_second``.
+        predicted: initial value of ``T_first_second``.
         squares: which.
 
     Returns:
@@ -191,7 +191,7 @@ def register_squares(first: Patch, second: Patch, predicted: SE2, *, squares: Sq
 
 
 def _resampled(first: Patch, second: Patch, T_first_second: SE2) -> Float[Array, "p q"]:
-    """The first patch on the raster of the second, nan where it shows nothing."""
+    """The first patch on the raster of the second, NaN where unknown."""
     rows, columns = second.raster.shape
     axes = (jnp.arange(length, dtype=second.values.dtype) for length in (columns, rows))
     u, v = (axis.reshape(-1) for axis in jnp.meshgrid(*axes))

@@ -1,4 +1,4 @@
-"""Pixels of a plane in meters: what lies between images of a floor and poses on it."""
+"""Metric raster: pixels of a plane and their coordinates in meters."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ class Raster(eqx.Module):
 
     @staticmethod
     def around(center: Float[Array, "2"], resolution: Any, shape: tuple[int, int]) -> "Raster":
-        """The raster whose middle lies at a point."""
+        """Raster centered at a point."""
         middle = jnp.array([0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1)], center.dtype)
         return Raster(center - middle * jnp.asarray(resolution, center.dtype), resolution, shape)
 
@@ -59,12 +59,12 @@ class Raster(eqx.Module):
         return x, y
 
     def corners(self) -> Float[Array, "4 2"]:
-        """The corner pixels' centers, m, in turn."""
+        """Centers of the corner pixels, m, in cyclic order."""
         right, top = self.shape[1] - 1.0, self.shape[0] - 1.0
         return self.to_meters(jnp.array([[0.0, 0.0], [right, 0.0], [right, top], [0.0, top]], self.origin.dtype))
 
     def warp(self, T_self_other: SE2, other: "Raster") -> Euclidean:
-        """Takes pixels of another raster, whose frame has a pose in this one's, to pixels of this raster.
+        """Warp from pixels of another raster, at a relative pose, to pixels of this one.
 
         Both must have one resolution: that of this one counts.
         """
@@ -78,7 +78,7 @@ class Raster(eqx.Module):
         return SE2.from_matrix(matrix.at[:2, 2].set(self.origin + self.resolution * matrix[:2, 2] - turned))
 
     def tangent_to_meters(self) -> Float[Array, "3 3"]:
-        """Takes tangents of a warp of this raster's pixels to those of the pose (m, m, rad).
+        """Matrix from tangents of a pixel warp to those of the pose (m, m, rad).
 
         A twist about pixel (0, 0) is one about the frame's origin with another velocity.
         """

@@ -1,4 +1,4 @@
-"""An image of a floor laid upon another: the motion between them, straight from gray levels."""
+"""Direct registration of two floor images: relative pose from gray levels."""
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ PAIRWISE = LucasKanade(scales=Pyramid(levels=4, least=40), min_coverage=0.2, max
 
 
 class Overlap(eqx.Module):
-    """What two patches show of the same floor; one pair, or a stack of pairs.
+    """Gray-level statistics of the overlap of two patches; one pair, or a stack.
 
     Attributes:
         share: part of the second patch that lies on the first.
@@ -34,7 +34,7 @@ class Overlap(eqx.Module):
 
 
 class Registration(eqx.Module):
-    """A motion between two images.
+    """Relative pose of two images, with its overlap statistics.
 
     Attributes:
         estimate: of ``T_first_second``, m and rad.
@@ -47,7 +47,7 @@ class Registration(eqx.Module):
 
 @eqx.filter_jit
 def register(first: Patch, second: Patch, predicted: SE2, *, method: LucasKanade = PAIRWISE) -> Registration:
-    """The pose of one camera over a floor in the frame of another, from what both saw.
+    """Estimates the pose of one camera over a floor in the frame of another by image alignment.
 
     Minimizes ``sum_x w(x) (first(T x) - gain second(x) - bias)^2`` over ``T = T_first_second`` by `lucas_kanade.align`
     on rotations and shifts, from coarse to fine; exposure is eliminated.
@@ -55,7 +55,7 @@ def register(first: Patch, second: Patch, predicted: SE2, *, method: LucasKanade
     Args:
         first: the piece of floor that is the reference.
         second: the piece that is laid upon it; of the same resolution.
-        predicted: guess of ``T_first_second``, right to a tenth of the overlap.
+        predicted: initial value of ``T_first_second``, right to a tenth of the overlap.
         method: choices of the alignment.
 
     Returns:
@@ -89,7 +89,7 @@ def register(first: Patch, second: Patch, predicted: SE2, *, method: LucasKanade
 
 
 def in_meters(estimate: Estimate, outer: Raster, inner: Raster) -> Estimate:
-    """The estimate of a warp of pixels as that of the pose between the frames of two rasters.
+    """Converts the estimate of a pixel warp to that of the pose between two rasters.
 
     Interpolation leaves errors of some thousandths of a pixel whatever the noise; their variance is added.
     """
@@ -106,7 +106,7 @@ def in_meters(estimate: Estimate, outer: Raster, inner: Raster) -> Estimate:
 def compare(
     first: Patch, second: Patch, T_first_second: SE2, *, method: AbstractInterpolation = Bilinear(), stride: int = 2
 ) -> Overlap:
-    """Brightness and contrast of two patches where they overlap, on every `stride`-th pixel each way."""
+    """Brightness and contrast of two patches in their overlap, on every `stride`-th pixel in each direction."""
     rows, columns = second.raster.shape
     dtype = second.values.dtype
     v, u = jnp.meshgrid(
@@ -121,8 +121,8 @@ def compare(
     safe = jnp.where(total > 0, total, 1.0)
     pair = jnp.stack([values, other])
     means = jnp.sum(both[None] * pair, axis=1) / safe
-    spread = jnp.sum(both[None] * (pair - means[:, None]) ** 2, axis=1) / safe
-    positive = spread > 0
-    deviations = jnp.where(positive, jnp.sqrt(jnp.where(positive, spread, 1.0)), 0.0)
+    variance = jnp.sum(both[None] * (pair - means[:, None]) ** 2, axis=1) / safe
+    positive = variance > 0
+    deviations = jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1.0)), 0.0)
     share = jnp.mean((both > 0).astype(dtype)) / jnp.maximum(jnp.mean((known > 0).astype(dtype)), 1e-6)
     return jax.lax.stop_gradient(Overlap(share, means, deviations))

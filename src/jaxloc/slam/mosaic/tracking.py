@@ -1,4 +1,4 @@
-"""A camera followed in a mosaic of the floor, at the rate of its images."""
+"""Camera tracking in a floor mosaic, image by image."""
 
 from typing import Any
 
@@ -33,7 +33,7 @@ def track(
     method: LucasKanade = TRACKING,
     margin: int = 32,
 ) -> Estimate:
-    """Pose of a camera over a floor from one image, a mosaic and a prediction.
+    """Estimates the pose of a camera over a floor from one image, a mosaic and a predicted pose.
 
     The image is rectified on the raster of the view and laid upon a window of the mosaic about the predicted pose
     (of a fixed size: one program serves all poses) by `lucas_kanade.align` on rotations and shifts.
@@ -41,7 +41,7 @@ def track(
     Args:
         mosaic: the map.
         image: gray levels, bytes or numbers.
-        predicted: guess of the pose ``T_floor_camera`` of the camera's road frame, right to `margin` pixels.
+        predicted: initial value of the pose ``T_floor_camera`` of the camera's road frame, right to `margin` pixels.
         view: camera and raster, of the mosaic's resolution; its `rectifier`, made once, is quicker. A smaller raster
             (`FloorView.part`) is quicker too.
         method: choices of the alignment.
@@ -64,8 +64,8 @@ def track(
         >>> poses = jax.vmap(jl.poses.SE2)(*jnp.asarray(drive.poses[:3], jnp.float32).T)
         >>> mosaic = blend(rectifier.rectify_all(drive.frames[:3]), poses, enclose(poses, rectifier.raster))
         >>> truth = jl.poses.SE2(*drive.poses[3])
-        >>> guess = truth @ jl.poses.SE2(4e-4, -4e-4, 0.01)
-        >>> found = track(mosaic, drive.frames[3], guess, view=rectifier)
+        >>> predicted = truth @ jl.poses.SE2(4e-4, -4e-4, 0.01)
+        >>> found = track(mosaic, drive.frames[3], predicted, view=rectifier)
         >>> bool(found.ok), bool(jnp.linalg.norm(truth.local(found.value)[:2]) < 1e-4)
         (True, True)
     """

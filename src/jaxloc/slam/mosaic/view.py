@@ -1,4 +1,4 @@
-"""What a camera over a floor sees of it, in meters and evenly lit: lens and vignetting taken out."""
+"""Rectified floor views: undistorted, vignetting removed, in metric coordinates."""
 
 from abc import abstractmethod
 from typing import Any
@@ -16,20 +16,20 @@ from jaxloc.sensors.ground_camera import GroundCamera
 from jaxloc.slam.mosaic.raster import Raster
 from jaxloc.solvers.cholesky import factor
 
-_DARKEST = 0.05  # less light than this tells nothing
+_DARKEST = 0.05  # least usable illumination
 _TAPER = 12.0  # pixels along the border of an image whose weight rises from zero
 
 
 class Falloff(eqx.Module):
-    """How a camera's image darkens from its middle to its corners."""
+    """Vignetting model (strategy)."""
 
     @abstractmethod
     def shade(self, u: Float[Array, "*n"], v: Float[Array, "*n"], cosine: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Part of the light that arrives at pixels, whose rays have a cosine with the optical axis."""
+        """Relative illumination at pixels with given cosine to the optical axis."""
 
 
 class CosineFourth(Falloff):
-    """The law of a lens without rims: ``cos^4`` of the angle off the axis."""
+    """Natural vignetting: ``cos^4`` of the angle to the optical axis."""
 
     def shade(self, u: Float[Array, "*n"], v: Float[Array, "*n"], cosine: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """``cos^4``."""
@@ -38,7 +38,7 @@ class CosineFourth(Falloff):
 
 
 class RadialFalloff(Falloff):
-    """A measured falloff: ``exp(c1 r^2 + c2 r^4 + c3 r^6)``, r counted from the middle of the image.
+    """Radial vignetting polynomial: ``exp(c1 r^2 + c2 r^4 + c3 r^6)``, r from the image center.
 
     Attributes:
         coefficients: c1, c2, c3.
@@ -51,7 +51,7 @@ class RadialFalloff(Falloff):
     radius: Float[Array, ""]
 
     def shade(self, u: Float[Array, "*n"], v: Float[Array, "*n"], cosine: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """The fitted law; level beyond twice the radius."""
+        """Relative illumination; constant beyond twice the radius."""
         del cosine
         square = ((u - self.center[0]) ** 2 + (v - self.center[1]) ** 2) / self.radius**2
         square = jnp.minimum(square, 4.0)
@@ -61,7 +61,7 @@ class RadialFalloff(Falloff):
 
 @eqx.filter_jit
 def fit_falloff(frames: Num[Array, "n h w"] | Any, *, black: Any = 0.0) -> RadialFalloff:
-    """Measures the falloff from images of many places: what they share is the camera's.
+    """Estimates vignetting from images of many places, as what they have in common.
 
     Least squares of the logarithm of the mean image, each image brought to mean one before.
 
@@ -105,11 +105,11 @@ def fit_falloff(frames: Num[Array, "n h w"] | Any, *, black: Any = 0.0) -> Radia
 
 
 class Patch(eqx.Module):
-    """A piece of floor on a raster: what one image shows in its camera's road frame, or a mosaic in the floor's.
+    """Patch of floor on a raster: one rectified image, or a mosaic.
 
     Attributes:
-        values: evenly lit gray levels; zero where nothing is seen.
-        weight: how much each is worth, in pixels from the middle of an image; zero where nothing is seen.
+        values: gray levels without vignetting; zero where unknown.
+        weight: weights, by the distance in pixels to the border of the image; zero where unknown.
         raster: where the pixels lie. In a stack of patches, one for all.
     """
 
@@ -119,21 +119,21 @@ class Patch(eqx.Module):
 
     @property
     def known(self) -> Bool[Array, "*n p q"]:
-        """Where there is floor."""
+        """Mask of the known pixels."""
         return self.weight > 0
 
     def with_gaps(self) -> Float[Array, "*n p q"]:
-        """The values with nan where nothing is seen."""
+        """The values, NaN where unknown."""
         return jnp.where(self.known, self.values, jnp.nan)
 
 
 class Rectifier(eqx.Module):
-    """Where each pixel of a raster of floor is found in an image, and how well it is lit: the same for all images.
+    """Precomputed rectification maps: image coordinates and illumination of each raster pixel.
 
     Attributes:
         u: columns in the image.
         v: rows in the image.
-        shade: part of the light that arrives; zero where the camera does not look.
+        shade: part of the light that arrives; zero outside the field of view.
         black: gray level of darkness.
         raster: of the floor.
         interpolation: of images.
@@ -193,7 +193,7 @@ def _depth(shape: tuple[int, int], dtype: Any) -> Float[Array, " n"]:
 
 
 class FloorView(eqx.Module):
-    """A camera over a floor and the raster on which it is looked at.
+    """Camera over a floor, and the raster to which its images are rectified.
 
     Attributes:
         ground: camera, lens, height and attitude.
@@ -219,10 +219,10 @@ class FloorView(eqx.Module):
         falloff: Falloff = CosineFourth(),
         black: Any = 0.0,
     ) -> "FloorView":
-        """The view of a camera's whole image, or of a part in its middle.
+        """View of the whole image, or of a central part.
 
         Args:
-            ground: camera that looks down.
+            ground: downward camera.
             image_shape: rows and columns of its images.
             shape: rows (along y) and columns (along x) of the raster; by default as many as the image has.
             resolution: edge of a pixel, m; by default what a pixel in the middle of the image covers.
@@ -245,7 +245,7 @@ class FloorView(eqx.Module):
         return FloorView(ground, falloff, jnp.asarray(black, height.dtype), Raster.around(center, resolution, shape))
 
     def part(self, shape: tuple[int, int]) -> "FloorView":
-        """The view of a smaller part in the middle, pixel for pixel.
+        """View of a smaller central part, with the same pixels.
 
         Raises:
             ValueError: it is larger than the whole, or not as odd or even as it.
@@ -260,7 +260,7 @@ class FloorView(eqx.Module):
 
     @eqx.filter_jit
     def rectifier(self) -> Rectifier:
-        """All that does not change from image to image, computed once."""
+        """Rectification maps, computed once for all images."""
         x, y = (axis.reshape(-1) for axis in self.raster.centers())
         u, v = self.ground.project_components(x, y)
         right, down, forward = self.ground.camera_components(x, y)

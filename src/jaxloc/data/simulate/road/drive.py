@@ -1,4 +1,4 @@
-"""A drive along a synthetic road: images, and where the vehicle was in its lane at each of them."""
+"""Simulated drive along a road: images with the true lane position of the vehicle."""
 
 from collections.abc import Iterator
 
@@ -14,7 +14,7 @@ from jaxloc.sensors.ground_camera import GroundCamera
 
 
 class Course(eqx.Module):
-    """How a drive goes: all of it waves about a mean, so that truth and motion agree exactly.
+    """Parameters of a drive: sinusoids about a mean, so that truth and motion agree exactly.
 
     Args:
         speed: m/s.
@@ -40,10 +40,10 @@ class Course(eqx.Module):
 
 
 class RoadDrive(eqx.Module):
-    """A drive with its truth; images are made when they are asked for.
+    """Drive with ground truth; images are rendered on demand.
 
     Attributes:
-        road: what it looks like.
+        road: appearance of the road.
         ground: the camera with its mean pitch.
         times: s.
         travelled: way along the road, m.
@@ -108,7 +108,7 @@ def drive(
     """Drives along a road: ``offset' = v sin(heading)``, ``yaw rate = heading' + v curvature`` (cosines taken as one).
 
     Args:
-        road: what it looks like.
+        road: appearance of the road.
         ground: the camera with its mean pitch.
         num_frames: images.
         course: how the drive goes.

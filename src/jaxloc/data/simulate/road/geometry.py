@@ -1,4 +1,4 @@
-"""Places on a road: the way along it and the distance from its center, by the estimators' model or exactly."""
+"""Road coordinates of ground points: arc length and lateral distance, by the small-angle model or exactly."""
 
 from abc import abstractmethod
 
@@ -15,11 +15,11 @@ Points = Float32[np.ndarray, " n"]
 
 
 class RoadGeometry(eqx.Module):
-    """How points of the ground get their place along and across a road; a strategy."""
+    """Conversion of ground points to road coordinates (strategy)."""
 
     @abstractmethod
     def place(self, lane: Lane, x: Points, y: Points) -> tuple[Points, Points]:
-        """The way along the lane from beside the vehicle, and the distance to the left of its center.
+        """Arc length along the lane from the vehicle, and lateral distance to the left of its center.
 
         Args:
             lane: where the vehicle is.
@@ -32,7 +32,7 @@ class RoadGeometry(eqx.Module):
 
 
 class SmallAngles(RoadGeometry):
-    """The model that the estimators share: ``s = x``, ``n = y - center(x)``.
+    """Small-angle model of the estimators: ``s = x``, ``n = y - center(x)``.
 
     Example:
         >>> import numpy as np, jaxloc as jl
@@ -43,7 +43,7 @@ class SmallAngles(RoadGeometry):
     """
 
     def place(self, lane: Lane, x: Points, y: Points) -> tuple[Points, Points]:
-        """The way ahead, and the difference along the vehicle's y axis."""
+        """Distance ahead, and difference along the vehicle's y axis."""
         offset, slope, curvature, rate = _numbers(lane)
         bend = 0.5 * curvature + x * (rate / 6.0)
         return x, y - (x * (x * bend - slope) - offset)

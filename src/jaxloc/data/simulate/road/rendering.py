@@ -1,6 +1,6 @@
-"""A road with painted marks, wheel tracks and shadows, seen by a camera whose place in the lane is known exactly.
+"""Rendering of a road with lane markings, wheel tracks and shadows, with exact lane position.
 
-What a road looks like is a function of the way along it, s, and of the place across it, n (m to the left of the lane's
+The appearance of a road is a function of the arc length s and of the lateral position n (m to the left of the lane's
 center). An image takes several rays a pixel to the ground; what they show is averaged over the ground that each of
 them stands for, so that dashes and shadows far away do not alias.
 """
@@ -21,7 +21,7 @@ from jaxloc.sensors.ground_camera import GroundCamera
 _TILE = 256  # texels along an edge of a repeating texture
 _OCTAVES = ((0.025, 0.6), (0.11, 0.6), (0.47, 0.45), (1.9, 0.3))  # size of a texel (m), share of the contrast
 _SHADOW_STEP = 0.1  # of the table of shadows, m
-_FARTHEST = 400.0  # ground beyond this looks as it does there, m
+_FARTHEST = 400.0  # ground beyond this range is rendered as at this range, m
 
 Points = Float32[np.ndarray, " n"]
 
@@ -63,7 +63,7 @@ class Mark(eqx.Module):
 
 
 class Streak(eqx.Module):
-    """A soft stripe along the lane: a wheel track, or the oil in the middle.
+    """Soft stripe along the lane, such as a wheel track.
 
     Args:
         left: of the lane's center, m.
@@ -105,12 +105,12 @@ class Shadows(eqx.Module):
 
 
 class Change(eqx.Module):
-    """Another road that follows.
+    """Transition to another road.
 
     Args:
         road: what it turns into.
         start: way at which the change begins, m.
-        length: over which the looks are blended, m: short for new asphalt, long for a slow drift.
+        length: over which both are blended, m: short for new asphalt, long for a slow drift.
     """
 
     road: "Road"
@@ -119,7 +119,7 @@ class Change(eqx.Module):
 
 
 class Road(eqx.Module):
-    """What a road looks like.
+    """Appearance of a road: markings, streaks, shadows and noise.
 
     Args:
         marks: painted lines; by default dashes on the left border of a lane 3.6 m wide, and a solid right border.
@@ -167,7 +167,7 @@ class Road(eqx.Module):
         """
         light = self._paint(s, n, along, across)
         if self.shadows is not None:
-            beside = np.clip(n, -30.0, 30.0)  # the table of shadows need not reach to where nobody looks
+            beside = np.clip(n, -30.0, 30.0)  # limits the table of shadows
             light *= _shadow_gain(self.shadows, self.seed, s + np.float32(self.shadows.skew) * beside, along)
         if self.change is None:
             return light
@@ -201,7 +201,7 @@ def render(
     """An image of a road.
 
     Args:
-        road: what it looks like.
+        road: appearance of the road.
         lane: where the vehicle is in its lane, and how that bends.
         ground: the camera, with its lens, height, pitch and roll.
         shape: rows and columns.
@@ -240,9 +240,9 @@ def render(
             )
             light[meets] = road.shade(s + np.float32(travelled), n, along, across)
             total += light.reshape(shape)
-    picture = total / np.float32(rays * rays)
-    picture += np.float32(noise) * np.random.default_rng([seed, 3]).standard_normal(shape, np.float32)
-    return np.clip(picture, 0.0, 255.0)
+    image = total / np.float32(rays * rays)
+    image += np.float32(noise) * np.random.default_rng([seed, 3]).standard_normal(shape, np.float32)
+    return np.clip(image, 0.0, 255.0)
 
 
 @eqx.filter_jit

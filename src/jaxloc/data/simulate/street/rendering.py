@@ -1,4 +1,4 @@
-"""Images of textured rectangles: exact depth, a depth buffer, one look-up a pixel.
+"""Renderer of textured rectangles with a depth buffer.
 
 A rectangle is ``corner + a * first + b * second`` with a and b in [0, 1]. Seen from a pinhole camera its inverse
 depth is affine in the pixel, and so are a and b divided by the depth: a handful of array operations on the rectangle's

@@ -1,6 +1,6 @@
 """Stereo images of a synthetic street, with true poses, depths and moving objects.
 
-The images are rendered when they are asked for (`rendering`), always the same ones for a seed.
+The images are rendered on demand (`rendering`), always the same ones for a seed.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ _FRAME_RATE = 10.0
 
 
 class MovingObject(eqx.Module):
-    """The truth about a box that moves.
+    """Ground truth of a moving box.
 
     Args:
         instance: its number in the instance images.
@@ -35,7 +35,7 @@ class MovingObject(eqx.Module):
 
 
 class StreetFrame(eqx.Module):
-    """A rendered pair and the truth about it.
+    """Rendered stereo pair with ground truth.
 
     Args:
         stereo: the images.
@@ -142,7 +142,7 @@ def simulate_street(
         exposure: standard deviation of the brightness factor of a frame.
 
     Returns:
-        The sequence; frames are rendered when they are asked for.
+        The sequence; frames are rendered on demand.
 
     Raises:
         ValueError: when there is to be no frame, or no pixel.

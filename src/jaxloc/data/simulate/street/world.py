@@ -1,4 +1,4 @@
-"""A street: a winding road, houses, poles, parked cars, and others that drive along it.
+"""Simulated street: a winding road, houses, poles, parked and moving cars.
 
 The world frame is that of the first camera: x right, y down, z forward, m. Things on the road stand at an arc length
 along the lane in which the camera drives and at a lateral position, to the right of it.
@@ -71,7 +71,7 @@ class Mover(eqx.Module):
 
 
 class Street(eqx.Module):
-    """What is there to be seen.
+    """All objects of a street.
 
     Args:
         road: where the camera drives.
