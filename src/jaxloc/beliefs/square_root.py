@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 
-_UNROLLED = 9  # up to here a loop of column steps beats the library call under vmap
-_UNROLLED_ROWS = 14  # the same for orthogonal factorizations
+_UNROLLED_ROWS = 14  # up to here a loop of row steps beats the library's orthogonal factorization under vmap
 _SMALLEST_STACK = 16  # matrices; below, the batch would fill no vector registers
 _LARGEST_PRODUCT = 16  # columns; beyond, the library's product
 
@@ -21,7 +20,7 @@ def cholesky(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """Lower triangular ``L`` with ``L L^T = covariance``.
 
     The matrix is scaled to unit diagonal and its pivots are kept above rounding (``d eps``), so that a covariance which
-    is singular, or a hair from positive, still has a finite root with finite gradients.
+    is singular, or indefinite by rounding, still has a finite root with finite gradients.
 
     Args:
         covariance: "d d", symmetric; the lower triangle is read.
@@ -39,10 +38,12 @@ def cholesky(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """
     info = jnp.finfo(covariance.dtype)
     size = covariance.shape[0]
+    floor = size * float(info.eps)
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), float(info.tiny) ** 0.5))
     correlation = covariance / scale[:, None] / scale[None, :]
-    factor = _columns if size <= _UNROLLED else _library
-    return scale[:, None] * factor(correlation, size * float(info.eps))
+    if size > _linalg.UNROLLED:  # the library's factorization has no floor of its own
+        correlation = correlation + floor * jnp.eye(size, dtype=covariance.dtype)
+    return scale[:, None] * _linalg.cholesky(correlation, floor)[0]
 
 
 def whiten(root: Float[Array, "d d"], residual: Float[Array, "d *k"]) -> Float[Array, "d *k"]:
@@ -53,15 +54,7 @@ def whiten(root: Float[Array, "d d"], residual: Float[Array, "d *k"]) -> Float[A
         >>> jl.beliefs.square_root.whiten(jnp.array([[2.0, 0.0], [1.0, 4.0]]), jnp.array([2.0, 5.0])).tolist()
         [1.0, 1.0]
     """
-    if root.shape[0] > _UNROLLED:
-        return solve_triangular(root, residual, lower=True)
-    rows: list[Array] = []
-    for i in range(root.shape[0]):
-        rest = residual[i]
-        for j in range(i):
-            rest = rest - root[i, j] * rows[j]
-        rows.append(rest / root[i, i])
-    return jnp.stack(rows)
+    return _linalg.forward_substitution(root, residual)
 
 
 def solve(root: Float[Array, "d d"], right: Float[Array, "d *k"]) -> Float[Array, "d *k"]:
@@ -72,8 +65,7 @@ def solve(root: Float[Array, "d d"], right: Float[Array, "d *k"]) -> Float[Array
         >>> jl.beliefs.square_root.solve(jnp.array([[2.0, 0.0], [0.0, 4.0]]), jnp.array([4.0, 16.0])).tolist()
         [1.0, 1.0]
     """
-    # The transposed system is lower triangular again when both its axes run backwards.
-    return whiten(root.T[::-1, ::-1], whiten(root, right)[::-1])[::-1]
+    return _linalg.back_substitution(root, whiten(root, right))
 
 
 @jax.custom_jvp
@@ -231,22 +223,3 @@ def _by_library(rows: Array) -> Array:
     signed = upper * jnp.where(jnp.diagonal(upper) < 0.0, -1.0, 1.0)[:, None]
     missing = max(rows.shape[0] - rows.shape[1], 0)
     return jnp.pad(signed, ((0, missing), (0, 0))).T
-
-
-def _columns(matrix: Array, floor: float) -> Array:
-    index, columns = jnp.arange(matrix.shape[0]), []
-    for j in range(matrix.shape[0]):
-        pivot = jnp.sqrt(jnp.maximum(matrix[j, j], floor))
-        # Beside a pivot of rounding size there is nothing but rounding, unless the matrix is no covariance.
-        below = jnp.where(matrix[j, j] > floor, matrix[:, j], 0.0) / pivot
-        column = jnp.where(index > j, below, jnp.where(index == j, pivot, 0.0))
-        columns.append(column)
-        matrix = matrix - column[:, None] * column[None, :]
-    return jnp.stack(columns, axis=1)
-
-
-def _library(matrix: Array, floor: float) -> Array:
-    eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
-    bad = ~jnp.all(jnp.isfinite(jnp.linalg.cholesky(lax.stop_gradient(matrix) + floor * eye)))
-    # Not positive: the root of the diagonal is a finite stand-in.
-    return jnp.linalg.cholesky(jnp.where(bad, eye, matrix) + floor * eye)

@@ -8,15 +8,11 @@ covariance there is huge but finite.
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import lineax as lx
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from jaxloc._linalg import matmul
-
-UNROLLED = 9
+from jaxloc._linalg import UNROLLED, back_substitution, cholesky, forward_substitution, matmul
 
 
 def rank_tolerance(dtype: Any) -> float:
@@ -46,7 +42,9 @@ class Factor(eqx.Module):
         """Solution of ``H x = vector`` with no component along undetermined pivots."""
         diagonal = jnp.where(self.lost, 1.0, jnp.diagonal(self.lower))
         kept = jnp.where(self.lost, 0.0, 1.0 / diagonal)
-        return self.scale * _back(self.lower, kept, _forward(self.lower, kept, self.scale * vector))
+        return self.scale * back_substitution(
+            self.lower, forward_substitution(self.lower, self.scale * vector, kept), kept
+        )
 
     def inverse(self) -> Float[Array, "d d"]:
         """Inverse of H; along undetermined pivots the variance is finite, but huge."""
@@ -54,7 +52,7 @@ class Factor(eqx.Module):
         if size <= UNROLLED:
             inverse = _unrolled_gram(_unrolled_inverse(self.lower))
         else:
-            inverse_lower = solve_triangular(self.lower, jnp.eye(size, dtype=self.scale.dtype), lower=True)
+            inverse_lower = forward_substitution(self.lower, jnp.eye(size, dtype=self.scale.dtype))
             inverse = matmul(inverse_lower.T, inverse_lower)
         return inverse * self.scale[:, None] * self.scale[None, :]
 
@@ -77,7 +75,6 @@ def factor(matrix: Float[Array, "d d"]) -> Factor:
         >>> factor.solve(jnp.array([8.0, 7.0])).round(4).tolist()
         [1.25, 1.5]
     """
-    size = matrix.shape[0]
     # A nan left in the matrix would pass to the derivatives of every entry scaled with it.
     matrix = jnp.where(jnp.isfinite(matrix), matrix, 0.0)
     diagonal = jnp.diagonal(matrix)
@@ -85,29 +82,8 @@ def factor(matrix: Float[Array, "d d"]) -> Factor:
     scale = jnp.where(positive, 1.0 / jnp.sqrt(jnp.where(positive, diagonal, 1.0)), 1.0)
     scaled = matrix * scale[:, None] * scale[None, :]
     scaled = jnp.where(jnp.isfinite(scaled), scaled, 0.0)
-    lower, lost = (_unrolled_cholesky if size <= UNROLLED else _guarded_cholesky)(scaled)
+    lower, lost = cholesky(scaled, rank_tolerance(matrix.dtype))
     return Factor(lower, lost, scale)
-
-
-def _unrolled_cholesky(scaled: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Bool[Array, " d"]]:
-    size, tolerance = scaled.shape[0], rank_tolerance(scaled.dtype)
-    zero = jnp.zeros((), scaled.dtype)
-    rows: list[list[Array]] = [[zero] * size for _ in range(size)]
-    lost = []
-    for j in range(size):
-        pivot = scaled[j, j]
-        for k in range(j):
-            pivot = pivot - rows[j][k] * rows[j][k]
-        bad = ~(pivot > tolerance)
-        rows[j][j] = jnp.sqrt(jnp.where(bad, tolerance, pivot))
-        inverse = 1.0 / rows[j][j]
-        lost.append(bad)
-        for i in range(j + 1, size):
-            value = scaled[i, j]
-            for k in range(j):
-                value = value - rows[i][k] * rows[j][k]
-            rows[i][j] = jnp.where(bad, 0.0, value * inverse)
-    return jnp.stack([jnp.stack(row) for row in rows]), jnp.stack(lost)
 
 
 def _unrolled_inverse(lower: Float[Array, "d d"]) -> list[list[Array]]:
@@ -134,52 +110,6 @@ def _unrolled_gram(rows: list[list[Array]]) -> Float[Array, "d d"]:
             terms = [rows[k][i] * rows[k][j] for k in range(i, size)]
             entry[i, j] = entry[j, i] = sum(terms[1:], start=terms[0])
     return jnp.stack([jnp.stack([entry[i, j] for j in range(size)]) for i in range(size)])
-
-
-def _guarded_cholesky(scaled: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Bool[Array, " d"]]:
-    """Library factorization for larger systems; if it fails, that of the matrix shifted by a little more than rounding.
-
-    Trials carry no derivatives: those of a factorization that failed are nan, and would pass through any mask after it.
-    """
-    failed = ~_factors(scaled)
-    lower = jnp.linalg.cholesky(jax.lax.cond(failed, _shifted, lambda matrix: matrix, scaled))
-    pivots = jnp.diagonal(lower) ** 2
-    return lower, (pivots < rank_tolerance(scaled.dtype)) | failed
-
-
-def _factors(matrix: Float[Array, "d d"]) -> Bool[Array, ""]:
-    return jnp.all(jnp.isfinite(jnp.linalg.cholesky(jax.lax.stop_gradient(matrix))))
-
-
-def _shifted(scaled: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    eye = jnp.eye(scaled.shape[0], dtype=scaled.dtype)
-    shifted = scaled + jnp.sqrt(jnp.finfo(scaled.dtype).eps) * eye
-    return jnp.where(_factors(shifted), shifted, eye)
-
-
-def _forward(lower: Array, inverse_diagonal: Array, vector: Array) -> Array:
-    if lower.shape[0] > UNROLLED:
-        return solve_triangular(lower, vector, lower=True)
-    solution: list[Array] = []
-    for i in range(lower.shape[0]):
-        value = vector[i]
-        for k in range(i):
-            value = value - lower[i, k] * solution[k]
-        solution.append(value * inverse_diagonal[i])
-    return jnp.stack(solution)
-
-
-def _back(lower: Array, inverse_diagonal: Array, vector: Array) -> Array:
-    size = lower.shape[0]
-    if size > UNROLLED:
-        return solve_triangular(lower, vector, lower=True, trans="T")
-    solution: list[Array] = [vector[0]] * size
-    for i in reversed(range(size)):
-        value = vector[i]
-        for k in range(i + 1, size):
-            value = value - lower[k, i] * solution[k]
-        solution[i] = value * inverse_diagonal[i]
-    return jnp.stack(solution)
 
 
 class Cholesky(lx.AbstractLinearSolver):
