@@ -22,7 +22,7 @@ SOURCE = REPOSITORY / "src" / "jaxloc"
 FILES = sorted(SOURCE.rglob("*.py"))
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 
-LONGEST_FILE, LONGEST_BODY, DEEPEST_CLASS = 400, 60, 2
+LONGEST_FILE, LONGEST_BODY, DEEPEST_CLASS, LARGEST_FOLDER = 400, 50, 2, 12
 
 
 def name_of(path: Path) -> str:
@@ -68,6 +68,45 @@ def test_functions_are_short(path):
     functions = [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     long = {function.name: body_lines(function) for function in functions if body_lines(function) > LONGEST_BODY}
     assert not long, f"bodies above {LONGEST_BODY} lines: {long}"
+
+
+@pytest.mark.parametrize("folder", sorted({path.parent for path in FILES}), ids=name_of)
+def test_folders_are_small(folder):
+    modules = [path.name for path in folder.glob("*.py") if not path.name.startswith("_")]
+    assert len(modules) <= LARGEST_FOLDER, f"{len(modules)} modules: split it by concept into folders"
+
+
+def guarded_imports(tree: ast.Module) -> set[ast.AST]:
+    """Imports within a `try` that handles an ImportError."""
+    return {
+        inner
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Try)
+        if any("ImportError" in ast.unparse(handler.type) for handler in node.handlers if handler.type is not None)
+        for statement in node.body
+        for inner in ast.walk(statement)
+    }
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_unstable_modules_of_jax_are_guarded(path):
+    """A module outside JAX's public interface may be gone in its next version: it needs a fallback."""
+    unstable = re.compile(r"jax\.(experimental|_src|extend|interpreters)|jaxlib")
+    tree = tree_of(path)
+    guarded = guarded_imports(tree)
+    found = [
+        f"line {node.lineno}: {name}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import | ast.ImportFrom) and node not in guarded
+        for name in ([alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module or ""])
+        if unstable.match(name)
+    ]
+    found += [
+        f"line {node.lineno}: {ast.unparse(node)}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and unstable.fullmatch(ast.unparse(node))
+    ]
+    assert not found, found
 
 
 def class_bases() -> dict[str, list[str]]:
@@ -194,6 +233,61 @@ def test_readme_figures_are_those_of_the_baseline(monkeypatch):
     unknown = set(re.findall(r"<!-- figure: ([\w.]+) -->", README)) - set(figures)
     assert not unknown, f"not in the baseline: {unknown}"
     assert fill(README, figures) == README, "run python -m benchmarks --readme README.md"
+
+
+# Metaphors and words that nobody in the field would search for, each with what to write. Checked as whole words in
+# lower case; identifiers count too, split at underscores.
+BANNED = {
+    "picture": "image",
+    "pictures": "images",
+    "grey": "gray",
+    "glass": "lens",
+    "twin": "counterpart",
+    "nobody": "no one, none",
+    "proof against": "robust to",
+    "a hair from": "within rounding of",
+    "come home": "return",
+    "comes home": "returns",
+    "speak": "confirm, report",
+    "speaks": "favors",
+    "spoken": "confirmed, reported",
+    "told": "given, known",
+    "says of itself": "reports",
+    "say of itself": "report",
+    "nobody is there": "empty",
+    "bad numbers": "non-finite values",
+    "gone bad": "non-finite",
+    "at its door": "at its inputs",
+    "at the door": "at the inputs",
+    "the way back": "the inverse",
+    "honest": "consistent",
+    "colour": "color",
+    "labelled": "labeled",
+    "neighbour": "neighbor",
+    "metre": "meter",
+    "centre": "center",
+}
+
+
+def words_of(path: Path) -> Iterator[tuple[int, str]]:
+    """Lines of a file as lower-case words: identifiers split at underscores, code spans and links left in."""
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        yield number, f" {' '.join(re.findall('[a-z]+', line.replace('_', ' ').lower()))} "
+
+
+@pytest.mark.parametrize(
+    "path",
+    [*FILES, REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"],
+    ids=lambda path: str(path.relative_to(REPOSITORY)),
+)
+def test_words_are_those_of_the_field(path):
+    found = [
+        f"line {number}: {banned!r}, write {instead!r}"
+        for number, line in words_of(path)
+        for banned, instead in BANNED.items()
+        if f" {banned} " in line
+    ]
+    assert not found, found
 
 
 def project_files() -> Iterator[Path]:
