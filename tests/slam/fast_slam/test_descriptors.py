@@ -16,8 +16,8 @@ from jaxloc.slam.fast_slam import (
     Candidates,
     DescriptorFastSlam,
     FastSlam,
-    FromBlock,
-    FromReading,
+    BlockProposal,
+    MeasurementProposal,
     Landmarks,
     associate,
 )
@@ -31,7 +31,7 @@ def motion():
     return IncrementMotion(drive=0.02, side=0.01, turn_drive=0.002, turn_turn=0.005)
 
 
-def slam(num_particles=50, capacity=CAPACITY, proposal=FromReading()):
+def slam(num_particles=50, capacity=CAPACITY, proposal=MeasurementProposal()):
     return FastSlam(motion(), *DEVIATIONS, num_particles=num_particles, capacity=capacity, proposal=proposal)
 
 
@@ -200,7 +200,7 @@ def test_looks_and_places_together_do_what_neither_does_alone(worlds, x64):
     assert sum(pure) > 0.97 * rows.size
 
 
-@pytest.mark.parametrize("proposal", [FromReading(), FromBlock(5)])
+@pytest.mark.parametrize("proposal", [MeasurementProposal(), BlockProposal(5)])
 def test_rows_are_shared_and_free_again(x64, proposal):
     """A row that no particle uses is free; descriptors are means over the readings that particles believed in."""
     filt = DescriptorFastSlam(slam(10, capacity=3, proposal=proposal), Appearance(0.5), length=2)

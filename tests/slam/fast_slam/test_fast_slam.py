@@ -10,7 +10,7 @@ from jaxloc.data.simulate.landmarks import simulate_landmarks
 from jaxloc.filters import run
 from jaxloc.poses import SE2, SO2, local
 from jaxloc.sensors import Increment, IncrementMotion, RangeBearing
-from jaxloc.slam.fast_slam import FastSlam, FromBlock, FromMotion, FromReading, trace_back
+from jaxloc.slam.fast_slam import FastSlam, BlockProposal, MotionProposal, MeasurementProposal, trace_back
 from jaxloc.slam.fast_slam.proposals import Particle
 
 DEVIATIONS = (0.1, 0.03)
@@ -20,7 +20,7 @@ def motion():
     return IncrementMotion(drive=0.05, side=0.02, turn_drive=0.01, turn_turn=0.02)
 
 
-def fast(num_particles=100, capacity=8, proposal=FromReading(), still=False):
+def fast(num_particles=100, capacity=8, proposal=MeasurementProposal(), still=False):
     model = IncrementMotion(drive=0.0, side=0.0, idle=0.0, turn_drive=0.0, turn_turn=0.0, turn_idle=0.0)
     return FastSlam(
         model if still else motion(), *DEVIATIONS, num_particles=num_particles, capacity=capacity, proposal=proposal
@@ -57,7 +57,7 @@ def laps():
 
             return jax.jit(jax.vmap(one))(worlds, keys)
 
-        return worlds, {type(p).__name__: solve(fast(proposal=p)) for p in (FromMotion(), FromReading(), FromBlock(40))}
+        return worlds, {type(p).__name__: solve(fast(proposal=p)) for p in (MotionProposal(), MeasurementProposal(), BlockProposal(40))}
 
 
 def map_error(worlds, end):
@@ -82,21 +82,21 @@ def ekf_slam_error(worlds):
 def test_maps_are_near_those_of_ekf_slam(laps, x64):
     """100 particles around a loop lose some of what one Gaussian keeps, and no more than that."""
     worlds, answers = laps
-    first, second = (map_error(worlds, answers[name][0]) for name in ("FromMotion", "FromReading"))
+    first, second = (map_error(worlds, answers[name][0]) for name in ("MotionProposal", "MeasurementProposal"))
     rival = ekf_slam_error(worlds)
     assert max(first, second) < 1.6 * rival
     # Poses that are drawn twice, not eighty times, lose less.
-    assert map_error(worlds, answers["FromBlock"][0]) < min(1.2 * rival, first, second)
+    assert map_error(worlds, answers["BlockProposal"][0]) < min(1.2 * rival, first, second)
     for _, infos, _, _ in answers.values():
         assert bool(infos.ok.all()) and np.isfinite(infos.log_likelihood).all()
     # The better proposal keeps more particles alive.
-    effective = [np.asarray(answers[name][1].ess).mean() for name in ("FromMotion", "FromReading", "FromBlock")]
+    effective = [np.asarray(answers[name][1].ess).mean() for name in ("MotionProposal", "MeasurementProposal", "BlockProposal")]
     assert effective[2] > effective[1] > effective[0]
 
 
 def test_traced_paths_end_in_the_last_poses(laps, x64):
     _, answers = laps
-    end, infos, path, poses = answers["FromReading"]
+    end, infos, path, poses = answers["MeasurementProposal"]
     for run_index in (0, 7):
         best = int(jnp.argmax(end.log_weights[run_index]))
         ancestors = np.asarray(infos.ancestors[run_index])
@@ -128,7 +128,7 @@ def test_with_a_known_path_each_landmark_is_a_kalman_filter(x64, rng):
     np.testing.assert_allclose(state.landmarks()[0], np.linalg.solve(information, total), atol=0.01)
 
 
-@pytest.mark.parametrize("proposal", [FromReading(), FromBlock(5)])
+@pytest.mark.parametrize("proposal", [MeasurementProposal(), BlockProposal(5)])
 def test_unknown_numbers_make_one_landmark_each(x64, proposal):
     filt = fast(num_particles=20, capacity=2, proposal=proposal)
     state = filt.init(start())
@@ -139,7 +139,7 @@ def test_unknown_numbers_make_one_landmark_each(x64, proposal):
     assert int(state.maps.support.sum()) == 20 * 12
 
 
-@pytest.mark.parametrize("proposal", [FromReading(), FromBlock(5)])
+@pytest.mark.parametrize("proposal", [MeasurementProposal(), BlockProposal(5)])
 def test_bad_readings_change_nothing(dtype, proposal):
     filt = fast(num_particles=20, capacity=2, proposal=proposal)
     state, _ = filt.update(filt.init(start()), reading(2.0, 0.3, 0), jnp.array(True), key=jax.random.key(0))
@@ -240,7 +240,7 @@ def short_drive():
         world = simulate_landmarks(
             motion(), jnp.array(DEVIATIONS), key=jax.random.key(3), num_steps=60, num_landmarks=3, laps=1.0, reach=25.0
         )
-        filt = fast(num_particles=1, capacity=3, proposal=FromBlock(1000))
+        filt = fast(num_particles=1, capacity=3, proposal=BlockProposal(1000))
         drive = (world.increments, world.readings, world.valid)
         return world, run(filt, filt.init(start()), *drive, key=jax.random.key(0))
 
@@ -276,7 +276,7 @@ def test_what_the_path_makes_uncertain_is_drawn(short_drive, x64):
         assert np.linalg.eigvalsh(joint - given).min() > -1e-12
         one = Particle(*jax.tree.map(lambda leaf: leaf[0], (state.poses, state.pending, state.maps)))
         normal = jax.random.normal(jax.random.key(t), (20_000, 9))
-        drawn = jax.jit(jax.vmap(FromBlock(1000).draw, in_axes=(None, 0)))(one, normal)
+        drawn = jax.jit(jax.vmap(BlockProposal(1000).draw, in_axes=(None, 0)))(one, normal)
         moves = jax.vmap(local, in_axes=(None, 0))(one.pose, drawn.pose)
         moves = np.concatenate([moves, (drawn.known.means - one.known.means[None]).reshape(-1, 6)], axis=1)
         scale = np.sqrt(np.outer(np.diag(joint), np.diag(joint)))
@@ -285,7 +285,7 @@ def test_what_the_path_makes_uncertain_is_drawn(short_drive, x64):
 
 
 def test_a_block_draws_between_steps_and_needs_a_key():
-    filt = fast(num_particles=3, capacity=1, proposal=FromBlock(2))
+    filt = fast(num_particles=3, capacity=1, proposal=BlockProposal(2))
     state, control = filt.init(start(0.1)), Increment(jnp.array(1.0), SE2(0.1, 0.0, 0.0))
     places = []
     for i in range(4):
@@ -295,4 +295,4 @@ def test_a_block_draws_between_steps_and_needs_a_key():
     with pytest.raises(ValueError, match="key"):
         filt.predict(state, control)
     with pytest.raises(ValueError, match="at least one step"):
-        FromBlock(0)
+        BlockProposal(0)
