@@ -3,7 +3,7 @@
 #
 # A camera sees points whose places are known. Where is it? That is the perspective-n-point problem, and the
 # pattern of most of localization: **residual, solver, estimate**. We refine a pose, check that its covariance
-# tells the truth, survive outliers, and differentiate through the solution.
+# is consistent, survive outliers, and differentiate through the solution.
 
 # %%
 import os
@@ -41,7 +41,7 @@ print("error (mm, mrad):", 1000 * fit.value.local(truth))
 print("sigmas          :", 1000 * jnp.sqrt(jnp.diagonal(fit.covariance)))
 
 # %% [markdown]
-# `ok` says whether to believe it. Here is what happens when the data do not determine the pose: fifty points
+# `ok` says whether it is valid. Here is what happens when the data do not determine the pose: fifty points
 # on one line leave the turn about it open. Nothing raises and nothing is NaN; on the host, `describe` names
 # the open direction.
 
@@ -51,10 +51,10 @@ blind = refine_pose(camera, line, camera.project(line), jl.poses.SE3.identity(),
 print(bool(blind.ok), "-", blind.describe())
 
 # %% [markdown]
-# ## A thousand poses, and an honest covariance
+# ## A thousand poses, and a consistent covariance
 #
 # `jax.vmap` makes a batch of the same call. We repeat the experiment with fresh noise and look at the squared
-# error in units of the covariance (NEES). If the covariance is honest, it has a chi-square distribution with
+# error in units of the covariance (NEES). If the covariance is consistent, it has a chi-square distribution with
 # six degrees of freedom.
 
 
@@ -83,7 +83,7 @@ plt.show()
 # %% [markdown]
 # ## Outliers
 #
-# Now a third of the pixels is wrong. Least squares believes them; a robust kernel takes their weight away.
+# Now a third of the pixels is wrong. Least squares gives them full weight; a robust kernel reduces it.
 # Bounded kernels such as Geman-McClure need a start that is not too far off, so we first ask a convex one,
 # Huber's.
 
@@ -172,7 +172,7 @@ print("focal length (px):", np.array(curve))
 # ## Takeaways
 #
 # - A problem is a whitened residual; `refine_pose` and `solve` return an `Estimate` with covariance and `ok`.
-# - Give the noise in its unit, and the covariance is honest: check it with NEES, over many runs.
+# - Give the noise in its unit, and the covariance is consistent: check it with NEES, over many runs.
 # - Robust kernels need a start nearby: a convex kernel or a consensus gives one.
 # - Derivatives go through the solution, and cost one Hessian, whatever the number of steps.
 #

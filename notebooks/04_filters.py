@@ -52,8 +52,8 @@ axes.legend()
 plt.show()
 
 # %% [markdown]
-# Masks are part of every update: `valid` says which measurements there are, and bad numbers mask themselves.
-# Is the covariance honest? The normalized error of a pose has three degrees of freedom.
+# Masks are part of every update: `valid` says which measurements there are, and non-finite numbers are masked too.
+# Is the covariance consistent? The normalized error of a pose has three degrees of freedom.
 
 # %%
 distance = jax.vmap(lambda state, pose: state.gaussian().mahalanobis_squared(pose))

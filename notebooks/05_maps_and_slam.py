@@ -74,7 +74,7 @@ if found.any():
 #
 # Now the landmarks are unknown too. EKF-SLAM holds one normal density over the pose and all landmarks. Its error is
 # chosen such that neither the motion nor the readings depend on the heading (an invariant filter): it does not learn a
-# heading that nothing shows, and stays honest where the textbook's coordinates grow overconfident.
+# heading that is not observable, and stays consistent where the textbook's coordinates become overconfident.
 
 # %%
 motion = jl.sensors.IncrementMotion(drive=0.05, side=0.02, turn_drive=0.02, turn_turn=0.05)

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # 7. Learning a tracker from its own measurements
 #
-# A tracker has numbers that nobody knows: how often a target is missed, how much clutter there is, how targets
+# A tracker has parameters that are hard to know: how often a target is missed, how much clutter there is, how targets
 # wander, how noisy the sensor is. The likelihood that a PHD filter predicts of each scan is differentiable, so that
 # these numbers can be learned from measurements alone: without true positions, without knowing what is clutter.
 
@@ -96,7 +96,7 @@ for number, axis in enumerate(axes):
 plt.show()
 
 # %% [markdown]
-# Which of these are targets? The eye cannot tell, nor has it to be told.
+# Which of these are targets? It cannot be seen in the plot, and need not be given.
 #
 # ## The likelihood, and its gradient
 

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # 8. Moving objects from a moving camera
 #
-# A stereo camera drives along a street. Most of what it sees stands still, and tells how the camera moves. What that
+# A stereo camera drives along a street. Most of what it sees stands still, which gives the camera motion. What that
 # motion does not explain moves by itself: it is matched once more, grouped to objects, and followed by a GM-PHD filter
 # in the world.
 

@@ -128,7 +128,7 @@ for label, run in {
 # ## Images of another kind
 #
 # Where dark has become bright, neither differences nor correlations help. Mutual information only asks that one image
-# tells something about the other.
+# is informative about the other.
 
 # %%
 inverted = 255.0 * (1.0 - jnp.clip(image, 0, 255) / 255.0) ** 1.5

@@ -63,7 +63,7 @@ plt.show()
 # %% [markdown]
 # ## Where in the lane, and how surely
 #
-# A template is what the road looks like across, saved once where the lane is known. `estimate` searches, matches, and
+# A template is the cross profile of the road, captured once where the lane is known. `estimate` searches, matches, and
 # fits offset, heading, curvature and the camera's pitch at once, each row with a gain and bias of its own: shadows
 # across the road do not matter. The covariance comes from leaving out stretches of road, and bands of it.
 

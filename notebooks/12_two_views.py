@@ -129,7 +129,7 @@ plt.tight_layout()
 plt.show()
 
 # %% [markdown]
-# Who knows the motion finds more: candidates off the epipolar line are no rivals any more, and the ratio test passes
+# With known motion more matches are found: the ratio test ignores candidates off the epipolar line, and passes
 # pairs that it refused before.
 
 # %%

@@ -1,10 +1,10 @@
 # %% [markdown]
 # # 13. Find the pallet
 #
-# A fork lift has to know where the pallet stands, to a centimeter and half a degree. An image tells: **edges of the
+# A fork lift has to know where the pallet stands, to a centimeter and half a degree. From an image: **edges of the
 # fork holes**, four of them picked by polarity and by a ratio that no range changes, the **kind** of pallet by
-# correlation, and the **pose** from four bearings. At the end the other way to use features: how fast they move tells
-# how the camera moves.
+# correlation, and the **pose** from four bearings. At the end another use of features: the motion of the camera from
+# their velocities in the image.
 
 # %%
 import os
@@ -162,7 +162,7 @@ plt.show()
 # - Polarity and a scale-free ratio find four edges among many; the fit, the correlation and the rows have to agree, or
 #   `ok` is False.
 # - Four bearings tell a pose with its covariance; heading is what they tell worst.
-# - Flow with depth tells the whole twist, without depth the direction and the rotation.
+# - Flow with depth determines the whole twist, without depth the direction and the rotation.
 #
 # ## Next steps
 #

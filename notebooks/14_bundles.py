@@ -57,7 +57,7 @@ odometry = jax.tree.map(lambda *leaves: jnp.stack(leaves), *chain)
 # %% [markdown]
 # ## The bundle
 #
-# It starts from odometry, and points from where each was seen first. Tables of who sees what are made once; the solver
+# It starts from odometry, and points from where each was seen first. Index tables are made once; the solver
 # eliminates the points, so that what is left is six rows a camera.
 
 # %%
