@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxloc.features.fast import CIRCLE, fast, segment_score, strongest, thin_out
+from jaxloc.features.fast import CIRCLE, fast, segment_score, strongest_keypoints, suppress_non_maxima
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_strongest_come_first_and_slots_are_safe(picture):
     few, many = fast(image, threshold=20.0, capacity=10), fast(image, threshold=20.0, capacity=2000)
     assert corners(few) <= corners(many) and float(few.response.min()) >= float(many.response[10])
     assert not np.asarray(many.uv)[~np.asarray(many.valid)].any() and not many.angle.any()
-    assert strongest(jnp.zeros((4, 5)), 30).valid.shape == (30,)
+    assert strongest_keypoints(jnp.zeros((4, 5)), 30).valid.shape == (30,)
 
 
 def test_score_does_not_depend_on_bias_and_turns(picture):
@@ -82,7 +82,11 @@ def test_gradients_equal_differences(x64, rng):
 @pytest.mark.parametrize("image", [np.zeros((20, 20)), np.full((20, 20), np.nan), np.ones((5, 9)), np.ones((1, 1))])
 def test_nothing_is_found_where_nothing_is(image):
     found = fast(jnp.asarray(image, jnp.float32), capacity=4)
-    assert not found.valid.any() and np.isfinite(found.uv).all() and not thin_out(segment_score(jnp.ones((9, 9)))).any()
+    assert (
+        not found.valid.any()
+        and np.isfinite(found.uv).all()
+        and not suppress_non_maxima(segment_score(jnp.ones((9, 9)))).any()
+    )
 
 
 def test_wrong_arcs_are_refused():

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from jaxloc.features import Keypoints, sift
-from jaxloc.features.sift import describe_sift
+from jaxloc.features import Keypoints
+from jaxloc.features.sift import describe_sift, sift
 
 find = jax.jit(lambda image: sift(image, capacity=1500))
 

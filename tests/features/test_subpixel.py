@@ -8,8 +8,7 @@ import pytest
 
 from jaxloc.features import subpixel
 from jaxloc.features.match import match, row_gate
-from jaxloc.features.opencv.describe import describe
-from jaxloc.features.opencv.detect import ORB, ShiTomasi, detect
+from jaxloc.features.opencv import ORB, ShiTomasi, describe, detect
 from jaxloc.features.subpixel import PatchRefinement, refine_stereo, refine_translation
 from jaxloc.images.interpolation import Bicubic
 

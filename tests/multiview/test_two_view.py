@@ -159,3 +159,13 @@ def test_scale_is_free(x64):  # K-88
     far = SE3(T.rotation, 2.0 * T.translation)
     seen = [p[:, :2] / p[:, 2:] for p in (T.inverse().apply(points), far.inverse().apply(2.0 * points))]
     np.testing.assert_allclose(seen[0], seen[1], atol=1e-12)
+
+
+def test_inliers_are_a_mask_over_the_given_pairs(x64):
+    """1 % of true pairs lie beyond the gate; a false pair lies within by chance."""
+    first, second, _, _ = pairs(5)
+    valid = np.arange(COUNT) % 7 > 0
+    fit, wrong = run(first, second, 5, valid=valid), np.arange(COUNT) < int(0.4 * COUNT)
+    inliers = np.asarray(fit.inliers)
+    assert bool(fit.ok) and not inliers[~valid].any()
+    assert inliers[valid & ~wrong].mean() > 0.95 and inliers[valid & wrong].mean() < 0.1

@@ -1,4 +1,4 @@
-"""BRIEF in JAX: bits from comparing pairs of pixels, turned with the keypoint, and which pairs to compare."""
+"""BRIEF descriptors: binary comparisons of pairs of pixels, rotated with the keypoint, and selection of the pairs."""
 
 import math
 
@@ -13,21 +13,21 @@ from jaxloc._linalg import matmul
 from jaxloc.features.harris import Box
 from jaxloc.features.keypoints import Descriptors, Keypoints
 
-# Side of the described patch, and of the squares whose means are compared, px.
+# Side of the patch, and of the squares whose means are compared, px.
 SIDE, _MEAN = 31, 5
 
 
 @eqx.filter_jit
 def intensity_centroid(image: Float[Array, "h w"], uv: Float[Array, "n 2"], *, radius: int = 15) -> Float[Array, " n"]:
-    """Direction from a corner to the centroid of the brightness around it, ``atan2(m01, m10)``.
+    """Orientation by the intensity centroid of a disc around a corner, ``atan2(m01, m10)``.
 
     Args:
-        image: gray levels; continued by its border.
-        uv: places; read at the nearest pixels.
+        image: gray levels; continued by its border values.
+        uv: corners; rounded to whole pixels.
         radius: of the disc, px; static.
 
     Returns:
-        From the right axis towards down, rad in [0, 2 pi); zero where the disc is balanced.
+        From the right axis towards down, rad in [0, 2 pi); zero where the moments are zero.
 
     References:
         Rosin, "Measuring corner properties", CVIU 1999; Rublee et al., ICCV 2011, section 3.2 (oFAST) [T-52].
@@ -54,7 +54,7 @@ def intensity_centroid(image: Float[Array, "h w"], uv: Float[Array, "n 2"], *, r
 
 
 def _half_widths(radius: int) -> list[int]:
-    """Half the width of each row of a disc that is symmetric about its diagonals, as OpenCV rounds it."""
+    """Half the width of each row of a disc, symmetric about its diagonals, rounded as in OpenCV."""
     diagonal = math.ceil(radius * math.sqrt(0.5))
     widths = [round(math.sqrt(radius * radius - v * v)) for v in range(math.floor(radius * math.sqrt(0.5) + 1) + 1)]
     widths += [0] * (radius + 1 - len(widths))
@@ -69,14 +69,14 @@ def _half_widths(radius: int) -> list[int]:
 
 @eqx.filter_jit
 def draw_tests(key: Array, *, count: int = 256) -> Int[Array, "count 4"]:
-    """Pairs of places in a patch of 31 x 31, both normal about the middle with a fifth of the side as deviation.
+    """Random pairs of pixels in a patch of 31 x 31, normal about the center with a fifth of the side as deviation.
 
     Args:
         key: of the random numbers.
         count: pairs; static.
 
     Returns:
-        (right, down) of the first place and of the second, whole pixels within 13 of the middle.
+        (right, down) of the first pixel and of the second, whole numbers within 13 of the center.
 
     References:
         Calonder, Lepetit, Strecha, Fua, "BRIEF", ECCV 2010, section 3.2, sampling II [T-53].
@@ -93,9 +93,9 @@ def draw_tests(key: Array, *, count: int = 256) -> Int[Array, "count 4"]:
 
 @eqx.filter_jit
 def compare(image: Float[Array, "h w"], keypoints: Keypoints, tests: Int[Array, "t 4"]) -> Bool[Array, "n t"]:
-    """Whether the first place of each test is darker than the second, around each keypoint and turned with it.
+    """BRIEF tests: whether the first pixel of each pair is darker than the second, rotated with the keypoint.
 
-    Places are means of 5 x 5 pixels at the nearest pixel.
+    Compared are means of 5 x 5 pixels at the nearest pixel.
 
     Args:
         image: gray levels.
@@ -121,7 +121,7 @@ def compare(image: Float[Array, "h w"], keypoints: Keypoints, tests: Int[Array, 
 
 
 def _places(keypoints: Keypoints, tests: Int[Array, "t 4"]) -> tuple[Int[Array, "n 2 t"], Int[Array, "n 2 t"]]:
-    """Columns and rows of the first and second places of all tests."""
+    """Columns and rows of the first and second pixels of all tests."""
     pairs = tests.astype(keypoints.uv.dtype).reshape(-1, 2, 2).transpose(1, 0, 2)[None]
     cos, sin = (f(keypoints.angle)[:, None, None] for f in (jnp.cos, jnp.sin))
     right, down = pairs[..., 0], pairs[..., 1]
@@ -132,7 +132,7 @@ def _places(keypoints: Keypoints, tests: Int[Array, "t 4"]) -> tuple[Int[Array, 
 
 @eqx.filter_jit
 def brief(image: Float[Array, "h w"], keypoints: Keypoints, tests: Int[Array, "t 4"]) -> Descriptors:
-    """Bits of all tests, packed as OpenCV packs them, the first in the lowest bit.
+    """BRIEF descriptors: bits of all tests, packed as in OpenCV, the first in the lowest bit.
 
     Args:
         image: gray levels.
@@ -169,7 +169,7 @@ def brief(image: Float[Array, "h w"], keypoints: Keypoints, tests: Int[Array, "t
 
 @eqx.filter_jit
 def select_tests(bits: Bool[Array, "m k"], *, count: int = 256, limit: float = 0.2) -> Int[Array, " count"]:
-    """Chooses tests that are hardly correlated and come out even, as rBRIEF was learned.
+    """Selects tests of low correlation and means near a half, as rBRIEF was learned.
 
     Candidates are taken from the one whose mean is nearest to a half; one is kept when its absolute correlation with
     all that were kept is below the limit. The limit grows until enough are found.
@@ -200,15 +200,15 @@ def select_tests(bits: Bool[Array, "m k"], *, count: int = 256, limit: float = 0
     order = jnp.argsort(jnp.abs(mean - 0.5))
     centered = bits.astype(jnp.float32) - mean[None, :]
     length = jnp.sqrt(jnp.sum(centered * centered, axis=0))
-    # A test that always comes out alike tells nothing: it counts as correlated with all.
+    # A constant test has no information: it counts as correlated with all.
     some = length > 0
     centered = centered / jnp.where(some, length, 1.0)[None, :]
-    alike = jnp.abs(matmul(centered.T, centered))
-    alike = jnp.where(some[:, None] & some[None, :], alike, 1.0)[order][:, order]
+    correlation = jnp.abs(matmul(centered.T, centered))
+    correlation = jnp.where(some[:, None] & some[None, :], correlation, 1.0)[order][:, order]
 
     def choose(most: Array) -> Bool[Array, " k"]:
         def visit(kept: Array, candidate: Array) -> tuple[Array, None]:
-            free = jnp.max(jnp.where(kept, alike[candidate], 0.0)) < most
+            free = jnp.max(jnp.where(kept, correlation[candidate], 0.0)) < most
             return kept.at[candidate].set(free), None
 
         return lax.scan(visit, jnp.zeros(total, bool), jnp.arange(total, dtype=jnp.int32))[0]
@@ -219,5 +219,5 @@ def select_tests(bits: Bool[Array, "m k"], *, count: int = 256, limit: float = 0
 
     first = jnp.asarray(limit, jnp.float32)
     found = lax.while_loop(lambda s: (jnp.sum(s[1]) < count) & (s[0] <= 1.0), raised, (first, choose(first)))[1]
-    # Alike ones fill up what is missing.
+    # Correlated ones fill the remaining slots.
     return order[jnp.argsort(~found, stable=True)[:count]].astype(jnp.int32)

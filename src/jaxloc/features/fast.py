@@ -1,4 +1,4 @@
-"""FAST in JAX: corners by the segment test, scored and thinned out as OpenCV does."""
+"""FAST corners: segment test, score and non-maximum suppression as in OpenCV, in JAX."""
 
 import functools
 
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxloc.features.keypoints import Keypoints
 
-# The circle of radius three, (right, down), clockwise from above.
+# The circle of radius three, (right, down), clockwise from the top.
 CIRCLE = (
     *((0, -3), (1, -3), (2, -2), (3, -1), (3, 0), (3, 1), (2, 2), (1, 3)),
     *((0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3)),
@@ -19,7 +19,7 @@ _RADIUS, _SIZE = 3, 7.0
 
 @eqx.filter_jit
 def segment_score(image: Float[Array, "h w"], *, arc: int = 9) -> Float[Array, "h w"]:
-    """The threshold up to which a pixel is a corner.
+    """FAST score: the greatest threshold at which a pixel is a corner.
 
     A pixel is a corner at threshold t when `arc` neighboring pixels of the 16 on a circle of radius three are all
     brighter than it by more than t, or all darker. So the score is ``max over arcs of min over the arc`` of differences
@@ -27,7 +27,7 @@ def segment_score(image: Float[Array, "h w"], *, arc: int = 9) -> Float[Array, "
 
     Args:
         image: gray levels.
-        arc: pixels in a row, 9 to 12 as a rule; static.
+        arc: number of contiguous pixels, 9 to 12 as a rule; static.
 
     Returns:
         Gray levels; zero where no arc is brighter or darker, and within three pixels of the border. For whole gray
@@ -55,14 +55,14 @@ def segment_score(image: Float[Array, "h w"], *, arc: int = 9) -> Float[Array, "
     inner = height - 2 * _RADIUS, width - 2 * _RADIUS
     starts = [(_RADIUS + down, _RADIUS + right) for right, down in CIRCLE]
     middle = lax.dynamic_slice(image, (_RADIUS, _RADIUS), inner)
-    apart = [lax.slice(image, s, (s[0] + inner[0], s[1] + inner[1])) - middle for s in starts]
-    brighter = functools.reduce(jnp.maximum, _least_of_arcs(apart, arc))
-    darker = functools.reduce(jnp.maximum, _least_of_arcs([-x for x in apart], arc))
+    differences = [lax.slice(image, s, (s[0] + inner[0], s[1] + inner[1])) - middle for s in starts]
+    brighter = functools.reduce(jnp.maximum, _least_of_arcs(differences, arc))
+    darker = functools.reduce(jnp.maximum, _least_of_arcs([-x for x in differences], arc))
     return jnp.pad(jnp.maximum(jnp.maximum(brighter, darker), 0.0), _RADIUS)
 
 
 def _least_of_arcs(values: list[Array], arc: int) -> list[Array]:
-    """Least value of `arc` neighbors from each place on, by doubling."""
+    """Least value of `arc` contiguous values from each position on, by doubling."""
     length, least = 1, values
     while 2 * length <= arc:
         least = [jnp.minimum(least[k], least[(k + length) % 16]) for k in range(16)]
@@ -73,12 +73,12 @@ def _least_of_arcs(values: list[Array], arc: int) -> list[Array]:
 
 
 @eqx.filter_jit
-def thin_out(score: Float[Array, "h w"]) -> Float[Array, "h w"]:
-    """Keeps scores above those of all eight neighbors; others, and equal ones side by side, become zero.
+def suppress_non_maxima(score: Float[Array, "h w"]) -> Float[Array, "h w"]:
+    """Non-maximum suppression: scores not above those of all eight neighbors become zero, equal neighbors too.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> thin_out(jnp.array([[0.0, 2.0, 3.0, 0.0, 1.0]])).tolist()
+        >>> suppress_non_maxima(jnp.array([[0.0, 2.0, 3.0, 0.0, 1.0]])).tolist()
         [[0.0, 0.0, 3.0, 0.0, 1.0]]
     """
     wide = jnp.pad(score, 1)
@@ -94,13 +94,13 @@ def fast(
     arc: int = 9,
     capacity: int = 1000,
 ) -> Keypoints:
-    """FAST corners: segment test, and no other corner with as high a score next to it.
+    """FAST corners: segment test and non-maximum suppression.
 
     Args:
         image: gray levels.
         threshold: least difference between a corner and its arc, gray levels.
-        arc: pixels in a row, 9 (FAST-9) to 12 (FAST-12); static.
-        capacity: keypoints that are kept, the highest scores first.
+        arc: number of contiguous pixels, 9 (FAST-9) to 12 (FAST-12); static.
+        capacity: greatest number of keypoints, the highest scores first.
 
     Returns:
         Keypoints at whole pixels, without orientation; `response` is the score.
@@ -115,22 +115,22 @@ def fast(
         >>> found.uv.tolist(), found.response.tolist(), found.valid.tolist()
         ([[15.0, 8.0], [0.0, 0.0]], [100.0, 0.0], [True, False])
     """
-    # A number would be a constant of the compiled program; as an array it may change freely.
+    # As an array, so that new values do not compile anew.
     return _fast(image, jnp.asarray(threshold, image.dtype), arc, capacity)
 
 
 @eqx.filter_jit
 def _fast(image: Array, threshold: Array, arc: int, capacity: int) -> Keypoints:
     score = segment_score(image, arc=arc)
-    return strongest(thin_out(jnp.where(score > threshold, score, 0.0)), capacity)
+    return strongest_keypoints(suppress_non_maxima(jnp.where(score > threshold, score, 0.0)), capacity)
 
 
-def strongest(response: Float[Array, "h w"], capacity: int) -> Keypoints:
+def strongest_keypoints(response: Float[Array, "h w"], capacity: int) -> Keypoints:
     """Keypoints at the highest positive responses.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> strongest(jnp.zeros((4, 5)).at[2, 3].set(1.0), 2).uv.tolist()
+        >>> strongest_keypoints(jnp.zeros((4, 5)).at[2, 3].set(1.0), 2).uv.tolist()
         [[3.0, 2.0], [0.0, 0.0]]
     """
     flat, width = response.reshape(-1), response.shape[1]

@@ -1,4 +1,4 @@
-"""Corner responses of the structure tensor, differentiable in the image, and subpixel peaks."""
+"""Harris and Shi-Tomasi corner responses of the structure tensor, and subpixel refinement of their peaks."""
 
 from abc import abstractmethod
 
@@ -10,7 +10,7 @@ from jaxloc.images.gradients import convolve_columns, convolve_rows, smooth, sob
 
 
 class AbstractWindow(eqx.Module):
-    """How the structure tensor is averaged over a pixel's neighborhood."""
+    """Weights by which the structure tensor is averaged over a neighborhood."""
 
     @abstractmethod
     def average(self, image: Float[Array, "h w"]) -> Float[Array, "h w"]:
@@ -37,7 +37,7 @@ class Box(AbstractWindow):
 
 
 class GaussianWindow(AbstractWindow):
-    """Gaussian weights: a response that does not depend on orientation.
+    """Gaussian weights: an isotropic response.
 
     Attributes:
         sigma: Standard deviation, px.
@@ -65,11 +65,11 @@ class StructureTensor(eqx.Module):
 
 
 class SubpixelPeaks(eqx.Module):
-    """Peaks of a response, found between its pixels.
+    """Peaks of a response with subpixel positions.
 
     Attributes:
         uv: Pixel coordinates (right, down); the pixel itself where not ok.
-        ok: True where a paraboloid has its maximum within one pixel of the given one.
+        ok: True where the quadratic model has its maximum within one pixel of the given one.
     """
 
     uv: Float[Array, "n 2"]
@@ -83,7 +83,7 @@ def structure_tensor(image: Float[Array, "h w"], *, window: AbstractWindow | Non
     `E(d) = d^T M d` approximates the mean squared change of the window under a small displacement `d`.
 
     Args:
-        image: Gray image.
+        image: Grayscale image.
         window: `Box()` (the default, 3x3) or `GaussianWindow()`.
 
     Returns:
@@ -111,7 +111,7 @@ def harris(
     """Harris's corner response `R = det M - k (tr M)^2`.
 
     Args:
-        image: Gray image.
+        image: Grayscale image.
         k: Weight of the trace, 0.04 to 0.15.
         window: `Box()` (the default, 3x3) or `GaussianWindow()`.
 
@@ -128,7 +128,7 @@ def harris(
         >>> bool(response[4, 4] > 0), bool(response[4, 8] < 0), float(response[8, 8])
         (True, True, 0.0)
     """
-    # A number would be a constant of the compiled program; as an array it may change freely.
+    # As an array, so that new values do not compile anew.
     return _harris(structure_tensor(image, window=window), jnp.asarray(k, image.dtype))
 
 
@@ -143,7 +143,7 @@ def shi_tomasi(image: Float[Array, "h w"], *, window: AbstractWindow | None = No
     """The smaller eigenvalue of M, `(uu + vv) / 2 - sqrt(((uu - vv) / 2)^2 + uv^2)`.
 
     Args:
-        image: Gray image.
+        image: Grayscale image.
         window: `Box()` (the default, 3x3) or `GaussianWindow()`.
 
     Returns:
@@ -162,14 +162,14 @@ def shi_tomasi(image: Float[Array, "h w"], *, window: AbstractWindow | None = No
     tensor = structure_tensor(image, window=window)
     half_difference = 0.5 * (tensor.uu - tensor.vv)
     squared = half_difference * half_difference + tensor.uv * tensor.uv
-    # The root has no gradient where both eigenvalues agree; its subgradient 0 is taken there.
+    # The root has no gradient where both eigenvalues are equal; the subgradient 0 is used there.
     apart = squared > 0
     root = jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0)
     return 0.5 * (tensor.uu + tensor.vv) - root
 
 
 def classify(response: Float[Array, "h w"], threshold: float | Float[Array, ""]) -> Int[Array, "h w"]:
-    """Sorts pixels by Harris's response: 1 is a corner (`R > t`), -1 an edge (`R < -t`), 0 flat.
+    """Classifies pixels by Harris's response: 1 is a corner (`R > t`), -1 an edge (`R < -t`), 0 flat.
 
     References:
         The three classes of Harris and Stephens (1988) [T-25].
@@ -184,7 +184,7 @@ def classify(response: Float[Array, "h w"], threshold: float | Float[Array, ""])
 
 @eqx.filter_jit
 def refine_peaks(response: Float[Array, "h w"], uv: Float[Array, "n 2"]) -> SubpixelPeaks:
-    """Moves peaks to the maximum of the paraboloid through the 3x3 responses around each.
+    """Moves peaks to the maximum of the quadratic model of the 3x3 responses around each.
 
     `d = -H^-1 g` with the gradient g and the Hessian H by central differences.
 
@@ -214,12 +214,12 @@ def refine_peaks(response: Float[Array, "h w"], uv: Float[Array, "n 2"]) -> Subp
         return response[v + down, u + right]
 
     slope_u, slope_v = 0.5 * (at(1, 0) - at(-1, 0)), 0.5 * (at(0, 1) - at(0, -1))
-    bend_u, bend_v = at(1, 0) + at(-1, 0) - 2.0 * at(0, 0), at(0, 1) + at(0, -1) - 2.0 * at(0, 0)
-    twist = 0.25 * (at(1, 1) + at(-1, -1) - at(1, -1) - at(-1, 1))
-    determinant = bend_u * bend_v - twist * twist
-    maximum = within & (bend_u < 0) & (determinant > 0)
+    uu, vv = at(1, 0) + at(-1, 0) - 2.0 * at(0, 0), at(0, 1) + at(0, -1) - 2.0 * at(0, 0)
+    uv_mixed = 0.25 * (at(1, 1) + at(-1, -1) - at(1, -1) - at(-1, 1))
+    determinant = uu * vv - uv_mixed * uv_mixed
+    maximum = within & (uu < 0) & (determinant > 0)
     divisor = jnp.where(maximum, determinant, 1.0)
-    offset = jnp.stack([twist * slope_v - bend_v * slope_u, twist * slope_u - bend_u * slope_v], axis=1)
+    offset = jnp.stack([uv_mixed * slope_v - vv * slope_u, uv_mixed * slope_u - uu * slope_v], axis=1)
     offset = jnp.where(maximum[:, None], offset / divisor[:, None], 0.0)
     ok = maximum & jnp.all(jnp.abs(offset) <= 1.0, axis=1)
     return SubpixelPeaks(jnp.where(ok[:, None], jnp.round(uv) + offset.astype(uv.dtype), uv), ok)

@@ -1,9 +1,10 @@
-"""KAZE and A-KAZE in JAX: blobs of a nonlinear scale space, whose edges stay where they are.
+"""KAZE features: blobs of a nonlinear scale space and M-SURF descriptors, in JAX; the base of A-KAZE.
 
 References:
-    Alcantarilla, Bartoli, Davison, "KAZE features", ECCV 2012; Alcantarilla, Nuevo, Bartoli, "Fast explicit diffusion
-    for accelerated features in nonlinear scale spaces", BMVC 2013.
+    Alcantarilla, Bartoli, Davison, "KAZE features", ECCV 2012.
 """
+
+from abc import abstractmethod
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,92 +12,139 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxloc.features.kaze_words import MLdb, MSurf, Words
 from jaxloc.features.keypoints import Descriptors, Keypoints
 from jaxloc.features.scale_space.extrema import ExtremumTest, find_extrema
-from jaxloc.features.scale_space.nonlinear import DiffusedScaleSpace, Samples, Stack, read, samples_of, seat_of, stacks
-from jaxloc.features.scale_space.orientation import disc, dominant_direction
+from jaxloc.features.scale_space.nonlinear import NonlinearScaleSpace, Stack, nonlinear_scale_space
+from jaxloc.features.scale_space.orientation import disc_offsets, dominant_direction, normalize_rows, rotate_gradients
+from jaxloc.features.scale_space.sampling import (
+    LayerSamples,
+    concatenate_layers,
+    interpolate_layer,
+    nearest_layer,
+    oriented_grid,
+)
 
-# Radius of the orientation and deviation of its Gaussian, in samples.
-_RADIUS, _SPREAD = 6, 2.5
-# Maxima that are looked at for each slot: many lie on ridges, where the paraboloid's vertex runs away, or have rivals.
+# Orientation: radius of the neighborhood and standard deviation of its Gaussian weights, in samples.
+_RADIUS, _SIGMA = 6, 2.5
+# M-SURF: cells along a side, samples along a cell and between two cells; deviations of the Gaussians (samples, cells).
+_CELLS, _CELL, _SHIFT, _CELL_SIGMA, _GRID_SIGMA = 4, 9, 5, 2.5, 1.5
+# Candidates for each slot: many lie on ridges, where the vertex of the quadratic model is far away, or are suppressed.
 _SURPLUS = 4
-# Keypoints of neighboring layers, whose sizes differ by less, are rivals.
-_ALIKE = 1.35
+# Keypoints suppress weaker ones whose size differs by less than this ratio.
+_SIZE_RATIO = 1.35
+
+
+class AbstractDescriptor(eqx.Module):
+    """Descriptor computed from the samples around a keypoint."""
+
+    side: eqx.AbstractClassVar[int]
+
+    @abstractmethod
+    def describe(self, values: Float[Array, "n k 3"], inside: Bool[Array, "n k"], angle: Float[Array, " n"]) -> Array:
+        """Descriptors from a sampling grid of ``side x side``, rotated with the keypoint.
+
+        Args:
+            values: gray level, derivative along rows and along columns of the image.
+            inside: which samples lie inside of the image.
+            angle: of the keypoint, rad.
+        """
+
+
+class MSurf(AbstractDescriptor):
+    """M-SURF descriptor: sums of derivatives and of their absolute values in 4 x 4 overlapping cells, 64 numbers.
+
+    Gaussian weights about the center of each cell and about the keypoint; normalized to length one.
+
+    References:
+        Agrawal, Konolige, Blas, "CenSurE", ECCV 2008; Alcantarilla et al., ECCV 2012, section 3.2.
+    """
+
+    side = _SHIFT * (_CELLS - 1) + _CELL
+
+    def describe(self, values: Float[Array, "n k 3"], inside: Bool[Array, "n k"], angle: Float[Array, " n"]) -> Array:
+        """Descriptors "n 64" of length one."""
+        derivatives = jnp.where(inside[:, :, None], values[:, :, 1:], 0.0)
+        along, across = rotate_gradients(derivatives[:, :, 0], derivatives[:, :, 1], angle)
+        cells = jnp.asarray(self.cell_weights(), values.dtype)
+        sums = [part @ cells for part in (along, across, jnp.abs(along), jnp.abs(across))]
+        return normalize_rows(jnp.stack(sums, axis=2).reshape(len(angle), -1))
+
+    def cell_weights(self) -> np.ndarray:
+        """Weights of all samples in the sums of all cells.
+
+        Example:
+            >>> MSurf().cell_weights().shape
+            (576, 16)
+        """
+        sample, cell = np.arange(self.side)[:, None], np.arange(_CELLS)[None, :]
+        offset = sample - (_SHIFT * cell + 0.5 * (_CELL - 1))
+        share = np.where(2 * np.abs(offset) < _CELL, np.exp(-0.5 * (offset / _CELL_SIGMA) ** 2), 0.0)
+        share = share * np.exp(-0.5 * ((cell - 0.5 * (_CELLS - 1)) / _GRID_SIGMA) ** 2)
+        return np.kron(share, share)
 
 
 class Kaze(eqx.Module):
-    """What KAZE looks for.
+    """Options of KAZE; `akaze_options` makes those of A-KAZE.
 
     Attributes:
         scales: the nonlinear scale space.
-        words: descriptors, `MSurf` or `MLdb`.
-        flat: a keypoint is a maximum of its layer with no stronger one near it in the next layers (A-KAZE), not a
-            maximum over place and scale (KAZE).
-        least_response: least determinant of a keypoint, as a share of 255^2.
-        upright: all keypoints point to the right: for cameras that do not roll.
+        descriptor: `MSurf` or `MLdb`.
+        within_layer: keypoints are maxima of their own layer, suppressed by stronger ones nearby in adjacent layers
+            (A-KAZE); else maxima over position and scale (KAZE).
+        least_response: threshold of the determinant, as a fraction of 255^2.
+        upright: orientation zero for all keypoints: for cameras that do not roll.
     """
 
-    scales: DiffusedScaleSpace = DiffusedScaleSpace()
-    words: Words = MSurf()
-    flat: bool = eqx.field(static=True, default=False)
+    scales: NonlinearScaleSpace = NonlinearScaleSpace()
+    descriptor: AbstractDescriptor = MSurf()
+    within_layer: bool = eqx.field(static=True, default=False)
     least_response: float = eqx.field(static=True, default=1e-3)
     upright: bool = eqx.field(static=True, default=False)
-
-    @classmethod
-    def accelerated(cls) -> "Kaze":
-        """A-KAZE: octaves sampled by halves, fast explicit diffusion, binary descriptors.
-
-        Example:
-            >>> type(Kaze.accelerated().words).__name__
-            'MLdb'
-        """
-        return cls(DiffusedScaleSpace.accelerated(), MLdb(), flat=True)
 
 
 @eqx.filter_jit
 def kaze(image: Float[Array, "h w"], *, options: Kaze = Kaze(), capacity: int = 1000) -> tuple[Keypoints, Descriptors]:
-    """Keypoints with scale and orientation, and their descriptors.
+    """KAZE keypoints with scale and orientation, and their descriptors.
 
-    Maxima of the determinant of the Hessian, moved to the vertex of a paraboloid, unless a stronger one of about their
-    size lies within the reach of their derivatives; their direction is that of most derivatives within a window of 60
-    degrees.
+    Maxima of the determinant of the Hessian, refined by a quadratic model; a stronger one of about the same size within
+    the reach of the derivatives suppresses a weaker one. The orientation is the dominant direction of the derivatives
+    in a window of 60 degrees.
 
     Args:
         image: gray levels 0-255.
-        options: what to look for; `Kaze.accelerated()` is A-KAZE.
-        capacity: keypoints that are kept, the strongest first.
+        options: scale space, descriptor and thresholds.
+        capacity: greatest number of keypoints, the strongest first.
 
     Returns:
         Keypoints and their descriptors. ``size`` is twice the reach, as in OpenCV: 2 blurs for KAZE, 3 for A-KAZE.
 
     References:
-        Alcantarilla et al. 2012, 2013 [T-43, T-48...T-50].
+        Alcantarilla et al. 2012 [T-43, T-48].
 
     Example:
         >>> import jax.numpy as jnp
         >>> u, v = jnp.meshgrid(jnp.arange(64.0), jnp.arange(64.0))
         >>> image = 60 + 120 * jnp.exp(-((u - 30.3) ** 2 + 1.3 * (v - 33.6) ** 2) / 18)
-        >>> keypoints, descriptors = kaze(image, options=Kaze.accelerated(), capacity=4)
+        >>> keypoints, descriptors = kaze(image, capacity=4)
         >>> [round(float(x)) for x in keypoints.uv[0]], descriptors.values.shape
-        ([30, 34], (4, 61))
+        ([30, 34], (4, 64))
     """
-    found = stacks(image, options.scales)
-    samples = samples_of(found)
-    keypoints = _strongest(found, options, capacity)
+    stacks = nonlinear_scale_space(image, options.scales)
+    samples = _samples(stacks)
+    keypoints = _strongest(stacks, options, capacity)
     if not options.upright:
-        keypoints = eqx.tree_at(lambda k: k.angle, keypoints, _directions(samples, keypoints, options.scales))
+        keypoints = eqx.tree_at(lambda k: k.angle, keypoints, _orientations(samples, keypoints, options.scales))
     return keypoints, _describe(samples, keypoints, options)
 
 
 @eqx.filter_jit
 def describe_kaze(image: Float[Array, "h w"], keypoints: Keypoints, *, options: Kaze = Kaze()) -> Descriptors:
-    """Descriptors of any keypoints with a size and an angle, read from the nonlinear scale space.
+    """KAZE descriptors of given keypoints with size and orientation.
 
     Args:
         image: gray levels 0-255.
-        keypoints: `size` is twice the reach of derivatives.
-        options: the scale space and the descriptors.
+        keypoints: ``size`` is twice the reach of the derivatives.
+        options: scale space and descriptor.
 
     Returns:
         64 numbers of length one (`MSurf`) or 61 bytes (`MLdb`) a keypoint; zero where not valid.
@@ -105,70 +153,73 @@ def describe_kaze(image: Float[Array, "h w"], keypoints: Keypoints, *, options: 
         >>> import jax, jax.numpy as jnp
         >>> image = jax.random.uniform(jax.random.key(0), (64, 64), maxval=255.0)
         >>> points = Keypoints.from_uv(jnp.array([[30.0, 30.0]]), size=6.0)
-        >>> describe_kaze(image, points, options=Kaze.accelerated()).values.dtype
-        dtype('uint8')
+        >>> describe_kaze(image, points).values.shape
+        (1, 64)
     """
-    return _describe(samples_of(stacks(image, options.scales)), keypoints, options)
+    return _describe(_samples(nonlinear_scale_space(image, options.scales)), keypoints, options)
 
 
-def _strongest(found: tuple[Stack, ...], options: Kaze, capacity: int) -> Keypoints:
+def _samples(stacks: tuple[Stack, ...]) -> LayerSamples:
+    """Gray levels and both derivatives of all layers."""
+    return concatenate_layers([(s.layers, s.right, s.down) for s in stacks], [s.step for s in stacks])
+
+
+def _strongest(stacks: tuple[Stack, ...], options: Kaze, capacity: int) -> Keypoints:
     """The strongest maxima of the determinants of all stacks."""
-    scales, shape, parts = options.scales, found[0].layers.shape[1:], []
-    # A ridge of the determinant is no edge of the image.
-    test = ExtremumTest(255.0**2 * options.least_response, edge_ratio=1e6, minima=False, flat=options.flat)
-    for stack in found:
+    scales, shape, parts = options.scales, stacks[0].layers.shape[1:], []
+    # A ridge of the determinant is no edge of the image: no test of the ratio of curvatures.
+    least = 255.0**2 * options.least_response
+    test = ExtremumTest(least, edge_ratio=1e6, minima=False, within_layer=options.within_layer)
+    for stack in stacks:
         blobs = find_extrema(stack.determinant, test, capacity=_SURPLUS * capacity)
         sigma = scales.sigma * stack.step * jnp.exp2(blobs.place[:, 0] / scales.layers)
         uv = stack.step * blobs.place[:, :0:-1]
-        # What its second derivatives reach lies within the image: large blobs at the border are seldom found again.
-        far = jnp.asarray([shape[1] - 1, shape[0] - 1], uv.dtype)[None, :]
-        room = jnp.min(jnp.minimum(uv, far - uv), axis=1)
-        parts.append((uv, sigma, blobs.value, blobs.valid & (room >= 2.0 * scales.reach * sigma)))
+        # The second derivatives must lie within the image: large blobs at the border are seldom detected again.
+        last = jnp.asarray([shape[1] - 1, shape[0] - 1], uv.dtype)[None, :]
+        margin = jnp.min(jnp.minimum(uv, last - uv), axis=1)
+        parts.append((uv, sigma, blobs.value, blobs.valid & (margin >= 2.0 * scales.reach * sigma)))
     uv, sigma, value, valid = (jnp.concatenate(column) for column in zip(*parts, strict=True))
     _, best = lax.top_k(lax.stop_gradient(jnp.where(valid, value, -1.0)), min(_SURPLUS * capacity, value.shape[0]))
     uv, sigma, value, valid = uv[best], sigma[best], value[best], valid[best]
-    valid = valid & ~_has_rival(*lax.stop_gradient((uv, sigma)), valid, scales.reach)
+    valid = valid & ~_is_suppressed(*lax.stop_gradient((uv, sigma)), valid, scales.reach)
     kept = jnp.argsort(~valid, stable=True)[:capacity]
     uv, sigma, value, valid = uv[kept], sigma[kept], value[kept], valid[kept]
     size, none = jnp.where(valid, 2.0 * scales.reach * sigma, 0.0), jnp.zeros(valid.shape, jnp.int32)
     return Keypoints(uv, size, jnp.zeros_like(size), value, none, none, valid, "kaze")
 
 
-def _has_rival(uv: Array, sigma: Array, valid: Array, reach: float) -> Bool[Array, " n"]:
-    """Whether a keypoint that comes before is of about the same size and near: large blobs have several maxima."""
+def _is_suppressed(uv: Array, sigma: Array, valid: Array, reach: float) -> Bool[Array, " n"]:
+    """Whether an earlier keypoint of similar size lies within reach: large blobs have several maxima."""
     squared = sum((uv[:, None, k] - uv[None, :, k]) ** 2 for k in (0, 1))
     ratio = sigma[:, None] / sigma[None, :]
-    alike = (ratio < _ALIKE) & (ratio > 1.0 / _ALIKE)
+    similar = (ratio < _SIZE_RATIO) & (ratio > 1.0 / _SIZE_RATIO)
     index = jnp.arange(valid.shape[0])
     near = squared < (reach * sigma[:, None]) ** 2
-    return jnp.any(near & alike & valid[None, :] & (index[None, :] < index[:, None]), axis=1)
+    return jnp.any(near & similar & valid[None, :] & (index[None, :] < index[:, None]), axis=1)
 
 
-def _around(samples: Samples, keypoints: Keypoints, scales: DiffusedScaleSpace, side: tuple, angle: Array) -> tuple:
-    """Values on samples (right, down) about each keypoint, turned by an angle."""
+def _sample_grid(samples: LayerSamples, keypoints: Keypoints, scales: NonlinearScaleSpace, grid: tuple, angle: Array):
+    """Values and validity of samples on a grid (right, down) around each keypoint, rotated by an angle."""
     sigma = jnp.where(keypoints.valid, keypoints.size / (2.0 * scales.reach), scales.sigma)
-    seat = seat_of(samples, keypoints.uv, sigma, scales)
-    right, down = (jnp.asarray(axis, sigma.dtype)[None, :] for axis in side)
-    cos, sin = (f(angle)[:, None] * seat.reach[:, None] for f in (jnp.cos, jnp.sin))
-    u = seat.uv[:, :1] + cos * right - sin * down
-    v = seat.uv[:, 1:] + sin * right + cos * down
-    return read(samples, seat, u, v)
+    layer = nearest_layer(samples, keypoints.uv, sigma, first_sigma=scales.sigma, per_octave=scales.layers)
+    return interpolate_layer(samples, layer, *oriented_grid(layer.uv, angle, scales.reach * layer.sigma, *grid))
 
 
-def _directions(samples: Samples, keypoints: Keypoints, scales: DiffusedScaleSpace) -> Float[Array, " n"]:
-    columns, rows = (np.array(side) for side in disc(_RADIUS))
-    values, inside = _around(samples, keypoints, scales, (columns, rows), jnp.zeros_like(keypoints.size))
-    weight = jnp.asarray(np.exp(-0.5 * (columns**2 + rows**2) / _SPREAD**2), values.dtype)[None, :]
+def _orientations(samples: LayerSamples, keypoints: Keypoints, scales: NonlinearScaleSpace) -> Float[Array, " n"]:
+    columns, rows = (np.array(side) for side in disc_offsets(_RADIUS))
+    values, inside = _sample_grid(samples, keypoints, scales, (columns, rows), jnp.zeros_like(keypoints.size))
+    weight = jnp.asarray(np.exp(-0.5 * (columns**2 + rows**2) / _SIGMA**2), values.dtype)[None, :]
     weight = jnp.where(inside, weight, 0.0)
     direction = dominant_direction(weight * values[:, :, 1], weight * values[:, :, 2])
     return jnp.where(keypoints.valid & direction.ok, direction.angle, 0.0)
 
 
-def _describe(samples: Samples, keypoints: Keypoints, options: Kaze) -> Descriptors:
-    middle = np.arange(options.words.side) - 0.5 * (options.words.side - 1)
-    rows, columns = (axis.reshape(-1) for axis in np.meshgrid(middle, middle, indexing="ij"))
-    values, inside = _around(samples, keypoints, options.scales, (columns, rows), keypoints.angle)
-    words = options.words.of(values, inside, keypoints.angle)
-    slopes = jnp.sum(jnp.where(inside[:, :, None], jnp.abs(values[:, :, 1:]), 0.0), axis=(1, 2))
-    valid = keypoints.valid & (slopes > 0)
-    return Descriptors(jnp.where(valid[:, None], words, jnp.zeros((), words.dtype)), valid)
+def _describe(samples: LayerSamples, keypoints: Keypoints, options: Kaze) -> Descriptors:
+    side = options.descriptor.side
+    offsets = np.arange(side) - 0.5 * (side - 1)
+    rows, columns = (axis.reshape(-1) for axis in np.meshgrid(offsets, offsets, indexing="ij"))
+    values, inside = _sample_grid(samples, keypoints, options.scales, (columns, rows), keypoints.angle)
+    descriptors = options.descriptor.describe(values, inside, keypoints.angle)
+    gradients = jnp.sum(jnp.where(inside[:, :, None], jnp.abs(values[:, :, 1:]), 0.0), axis=(1, 2))
+    valid = keypoints.valid & (gradients > 0)
+    return Descriptors(jnp.where(valid[:, None], descriptors, jnp.zeros((), descriptors.dtype)), valid)

@@ -1,4 +1,4 @@
-"""Records of sparse features: fixed-size sets of keypoints and of their descriptors."""
+"""Fixed-size sets of keypoints, descriptors and matches."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,15 +6,15 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 
 class Keypoints(eqx.Module):
-    """A fixed-size set of points that stand out in an image; empty slots hold safe zeros.
+    """A fixed-size set of interest points of an image; empty slots hold zeros.
 
     Attributes:
         uv: Pixel coordinates (right, down), centers at integers.
-        size: Diameter of the neighborhood that matters, px.
+        size: Diameter of the neighborhood, px.
         angle: Orientation in rad, from the right axis towards down; 0 where the detector gives none.
-        response: How much the point stands out, in units of its detector.
-        octave: The detector's own pyramid level (OpenCV's packed form), read back by `describe` only.
-        layer: The detector's own class number (KAZE's evolution level), read back by `describe` only.
+        response: Strength, in units of its detector.
+        octave: The detector's own pyramid level (OpenCV's packed form), used by `opencv.describe` only.
+        layer: The detector's own class number (KAZE's evolution level), used by `opencv.describe` only.
         valid: False in empty slots.
         detector: Name of the detector; a descriptor of the same name may use octave and layer.
     """

@@ -1,4 +1,4 @@
-"""Matching of descriptors: distances of all pairs, gates on the pairs, and filters against wrong matches."""
+"""Descriptor matching: distances of all pairs, geometric gates, ratio test and mutual consistency."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jaxloc.features.keypoints import Descriptors, Matches, Nearest
 
 @eqx.filter_jit
 def hamming_distances(first: UInt8[Array, "n d"], second: UInt8[Array, "m d"]) -> Float[Array, "n m"]:
-    """Counts the bits in which packed binary descriptors differ.
+    """Hamming distances of all pairs of packed binary descriptors.
 
     Args:
         first: Packed bits, one row a descriptor.
@@ -25,8 +25,8 @@ def hamming_distances(first: UInt8[Array, "n d"], second: UInt8[Array, "m d"]) -
         >>> hamming_distances(jnp.array([[255, 1]], jnp.uint8), jnp.array([[255, 2]], jnp.uint8)).tolist()
         [[2.0]]
     """
-    # Counting bits of 32-bit words took a fifth of the time of a product of +-1 matrices.
-    a, b = _words(first), _words(second)
+    # Bit counts of 32-bit integers take a fifth of the time of a product of +-1 matrices.
+    a, b = _as_uint32(first), _as_uint32(second)
     bits = sum(lax.population_count(a[:, k][:, None] ^ b[:, k][None, :]) for k in range(a.shape[1]))
     return bits.astype(jnp.float32)
 
@@ -60,7 +60,7 @@ def row_gate(
     tolerance: float | Float[Array, ""] = 1.0,
     disparity: tuple[float, float] = (0.0, float("inf")),
 ) -> Bool[Array, "n m"]:
-    """Pairs of a rectified stereo pair that may match: the same row, and the right point to the left of the left one.
+    """Gate of a rectified stereo pair: pairs of nearly the same row and a disparity within limits.
 
     `|v_left - v_right| <= tolerance` and `lowest < u_left - u_right <= highest`.
 
@@ -88,10 +88,10 @@ def row_gate(
 def window_gate(
     uv_predicted: Float[Array, "n 2"], uv: Float[Array, "m 2"], *, radius: float | Float[Array, ""]
 ) -> Bool[Array, "n m"]:
-    """Pairs whose second point lies within `radius` pixels (per axis) of where the first is predicted.
+    """Gate of a search window: pairs whose second point lies within `radius` px (per axis) of the predicted first.
 
     Args:
-        uv_predicted: Where the first points should be seen in the second image.
+        uv_predicted: Predicted positions of the first points in the second image.
         uv: Pixels in the second image.
         radius: Half the side of the search window, px.
 
@@ -108,12 +108,12 @@ def window_gate(
 
 @eqx.filter_jit
 def nearest(distances: Float[Array, "n m"], allowed: Bool[Array, "n m"], *, axis: int = 1) -> Nearest:
-    """Finds the nearest allowed candidate of every row (or column), and how near the next one is.
+    """Nearest and second nearest allowed candidate of every row (or column).
 
     Args:
         distances: Distance of every pair.
         allowed: Which pairs may match.
-        axis: 1 looks along the row of each first point, 0 along the column of each second point.
+        axis: 1 searches the row of each first point, 0 the column of each second point.
 
     Returns:
         The nearest candidate of each point; the first of several at the same distance.
@@ -136,7 +136,7 @@ def nearest(distances: Float[Array, "n m"], allowed: Bool[Array, "n m"], *, axis
 
 
 def is_similar(found: Nearest, max_distance: float | Float[Array, ""]) -> Bool[Array, " n"]:
-    """Similarity filter: the nearest candidate is no farther than `max_distance` [T-11].
+    """Distance test: the nearest candidate is no farther than `max_distance` [T-11].
 
     Example:
         >>> import jax.numpy as jnp
@@ -147,7 +147,7 @@ def is_similar(found: Nearest, max_distance: float | Float[Array, ""]) -> Bool[A
 
 
 def is_distinct(found: Nearest, ratio: float | Float[Array, ""]) -> Bool[Array, " n"]:
-    """Ratio filter: `nearest < ratio * second nearest`; a single candidate passes.
+    """Ratio test: `nearest < ratio * second nearest`; a single candidate passes.
 
     References:
         Lowe (2004), section 7.1.
@@ -161,7 +161,7 @@ def is_distinct(found: Nearest, ratio: float | Float[Array, ""]) -> Bool[Array, 
 
 
 def is_mutual(found: Nearest, back: Nearest) -> Bool[Array, " n"]:
-    """Both-way filter: the candidate's own nearest is the point itself [T-11].
+    """Mutual consistency: the candidate's own nearest is the point itself [T-11].
 
     Args:
         found: Nearest candidates in the second set of each point of the first.
@@ -186,7 +186,7 @@ def match(
     ratio: float | Float[Array, ""] | None = None,
     mutual: bool = True,
 ) -> Matches:
-    """Matches two sets of descriptors; the filters that are given must all pass.
+    """Matches two sets of descriptors by nearest neighbors that pass all given tests.
 
     Args:
         first: Descriptors of the first image.
@@ -203,7 +203,7 @@ def match(
         ValueError: The descriptors are of different kinds.
 
     References:
-        Similarity, mutual and geometric filters [T-11]; stereo matches [T-71]; the ratio of Lowe (2004).
+        Distance, mutual and geometric tests [T-11]; stereo matches [T-71]; the ratio of Lowe (2004).
 
     Example:
         >>> import jax.numpy as jnp
@@ -251,7 +251,7 @@ def _match(first: Descriptors, second: Descriptors, gate, max_distance, ratio, m
     return Matches(jnp.where(passed, found.index, 0), jnp.where(passed, found.distance, 0.0), passed)
 
 
-def _words(packed: UInt8[Array, "n d"]):
-    """Rows of bytes as rows of 32-bit words, padded with zeros."""
+def _as_uint32(packed: UInt8[Array, "n d"]):
+    """Rows of bytes as rows of 32-bit integers, padded with zeros."""
     padded = jnp.pad(packed, ((0, 0), (0, -packed.shape[1] % 4)))
     return lax.bitcast_convert_type(padded.reshape(packed.shape[0], -1, 4), jnp.uint32)

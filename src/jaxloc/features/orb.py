@@ -1,4 +1,4 @@
-"""ORB in JAX: FAST corners over a pyramid, turned by the centroid of brightness, described by steered BRIEF."""
+"""ORB features: FAST corners of an image pyramid, oriented by intensity centroids, with steered BRIEF, in JAX."""
 
 import equinox as eqx
 import jax
@@ -7,18 +7,18 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxloc.features.brief import SIDE, brief, draw_tests, intensity_centroid
-from jaxloc.features.fast import segment_score, strongest, thin_out
+from jaxloc.features.fast import segment_score, strongest_keypoints, suppress_non_maxima
 from jaxloc.features.keypoints import Descriptors, Keypoints
 
-# Corners by FAST's score for each that is kept by Harris's.
+# Corners by FAST's score for each one that is kept by Harris's.
 _SURPLUS = 2
 
 
 class Orb(eqx.Module):
-    """What ORB looks for.
+    """Options of ORB.
 
     Attributes:
-        levels: levels of the pyramid; as many as the image has room for.
+        levels: greatest number of pyramid levels; fewer in small images.
         factor: ratio of neighboring levels.
         threshold: least contrast of a corner, gray levels.
         harris_k: weight of the trace in Harris's response, by which corners are ranked.
@@ -33,7 +33,7 @@ class Orb(eqx.Module):
     harris_k: float = eqx.field(static=True, default=0.04)
 
     def shapes(self, shape: tuple[int, ...]) -> list[tuple[int, int]]:
-        """Rows and columns of the levels that are larger than two patches, the first in any case."""
+        """Rows and columns of the levels: the first, and all that are larger than two patches."""
         sizes = [tuple(max(round(n / self.factor**level), 1) for n in shape) for level in range(self.levels)]
         return sizes[:1] + [size for size in sizes[1:] if min(size) > 2 * SIDE]
 
@@ -46,13 +46,13 @@ def orb(
     tests: Int[Array, "t 4"] | None = None,
     capacity: int = 1000,
 ) -> tuple[Keypoints, Descriptors]:
-    """Oriented FAST corners of all levels and their bits.
+    """ORB keypoints of all pyramid levels and their binary descriptors.
 
     Args:
         image: gray levels 0-255.
-        options: what to look for.
-        tests: pairs that are compared; drawn with a fixed key by default, so that descriptors of two calls agree.
-        capacity: keypoints in all; levels share it by their areas' roots.
+        options: pyramid and thresholds.
+        tests: pairs of BRIEF; drawn with a fixed key by default, so that descriptors of two calls are comparable.
+        capacity: number of keypoints; divided among levels in proportion to their width.
 
     Returns:
         Keypoints, level by level (``octave``), ``response`` being Harris's, and 256 packed bits each.
@@ -75,13 +75,13 @@ def orb(
     parts = []
     for level, (shape, start, end) in enumerate(zip(shapes, [0, *ends[:-1]], ends, strict=True)):
         smaller = image if level == 0 else jax.image.resize(image, shape, "linear")
-        parts.append(_of_level(smaller, options, tests, level, image.shape, end - start))
+        parts.append(_detect_level(smaller, options, tests, level, image.shape, end - start))
     keypoints, descriptors = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
     return keypoints, descriptors
 
 
-def _ranked(image: Array, corners: Keypoints, options: Orb, capacity: int) -> Keypoints:
-    """The corners with the greatest Harris responses in a window of 7 x 7."""
+def _rank_by_harris(image: Array, corners: Keypoints, options: Orb, capacity: int) -> Keypoints:
+    """The corners with the greatest Harris responses, in a window of 7 x 7."""
     side, width = jnp.arange(-4, 5, dtype=jnp.int32), image.shape[1]
     at = corners.uv.astype(jnp.int32)
     row = jnp.clip(at[:, 1, None] + side[None, :], 0, image.shape[0] - 1)
@@ -98,24 +98,26 @@ def _ranked(image: Array, corners: Keypoints, options: Orb, capacity: int) -> Ke
     return eqx.tree_at(lambda k: k.response, ranked, jnp.where(ranked.valid, response[best], 0.0))
 
 
-def _of_level(
+def _detect_level(
     image: Array, options: Orb, tests: Array, level: int, whole: tuple[int, ...], capacity: int
 ) -> tuple[Keypoints, Descriptors]:
     """Keypoints of a level, in pixels of the whole image."""
     margin = SIDE // 2 + 1
     score = segment_score(image)
-    corner = thin_out(jnp.where(score > options.threshold, score, 0.0))
+    corner = suppress_non_maxima(jnp.where(score > options.threshold, score, 0.0))
     rows, columns = (jnp.arange(n) for n in image.shape)
     inside = ((rows >= margin) & (rows < image.shape[0] - margin))[:, None]
     inside = inside & ((columns >= margin) & (columns < image.shape[1] - margin))[None, :]
-    found = _ranked(image, strongest(jnp.where(inside, corner, 0.0), _SURPLUS * capacity), options, capacity)
+    found = _rank_by_harris(
+        image, strongest_keypoints(jnp.where(inside, corner, 0.0), _SURPLUS * capacity), options, capacity
+    )
     angle = jnp.where(found.valid, intensity_centroid(image, found.uv, radius=SIDE // 2), 0.0)
     found = eqx.tree_at(lambda k: k.angle, found, angle)
-    words = brief(image, found, tests)
+    description = brief(image, found, tests)
     ratio = jnp.asarray([whole[1] / image.shape[1], whole[0] / image.shape[0]], image.dtype)
     # Pixels are squares: the corner of the image stays where it is, not the center of its first pixel.
-    uv = jnp.where(words.valid[:, None], (found.uv + 0.5) * ratio[None, :] - 0.5, 0.0)
-    size = jnp.where(words.valid, jnp.asarray(SIDE * options.factor**level, image.dtype), 0.0)
-    octave = jnp.where(words.valid, jnp.full_like(found.octave, level), 0)
-    angle, response = (jnp.where(words.valid, x, 0.0) for x in (found.angle, found.response))
-    return Keypoints(uv, size, angle, response, octave, found.layer, words.valid, "orb"), words
+    uv = jnp.where(description.valid[:, None], (found.uv + 0.5) * ratio[None, :] - 0.5, 0.0)
+    size = jnp.where(description.valid, jnp.asarray(SIDE * options.factor**level, image.dtype), 0.0)
+    octave = jnp.where(description.valid, jnp.full_like(found.octave, level), 0)
+    angle, response = (jnp.where(description.valid, x, 0.0) for x in (found.angle, found.response))
+    return Keypoints(uv, size, angle, response, octave, found.layer, description.valid, "orb"), description

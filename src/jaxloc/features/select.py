@@ -1,19 +1,19 @@
-"""Evenly spread selection of points over the cells of a grid, and how well a set of points covers an image."""
+"""Evenly distributed selection of points: per grid cell, by square covering, local maxima; coverage of an image."""
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-# Halvings of the side of the square in `cover_squares`.
-_HALVINGS = 12
+# Bisections of the side of the square in `cover_squares`.
+_BISECTIONS = 12
 
 
 class Selection(eqx.Module):
-    """Chosen points of a set.
+    """Selected points of a set.
 
     Attributes:
-        index: Which point each slot holds; 0 in empty slots.
+        index: The point of each slot; 0 in empty slots.
         valid: False in empty slots.
     """
 
@@ -36,12 +36,12 @@ class Peaks(eqx.Module):
 
 
 class Coverage(eqx.Module):
-    """How a set of points covers an image.
+    """Coverage of an image by a set of points.
 
     Attributes:
         counts: Points in each cell.
-        filled: Share of the cells that hold a point.
-        entropy: Entropy of the shares of points in cells over that of an even spread: 1 is even, 0 is all in one cell.
+        filled: Fraction of the cells that hold a point.
+        entropy: Entropy of the fractions of points in cells over that of a uniform distribution, 0 to 1.
     """
 
     counts: Int[Array, "rows columns"]
@@ -50,7 +50,7 @@ class Coverage(eqx.Module):
 
 
 @eqx.filter_jit
-def spread(
+def select_by_grid(
     uv: Float[Array, "n 2"],
     score: Float[Array, " n"],
     valid: Bool[Array, " n"],
@@ -60,28 +60,28 @@ def spread(
     capacity: int,
     per_cell: int | None = None,
 ) -> Selection:
-    """Chooses points so that the cells of a grid take turns, each giving its best remaining point.
+    """Selects points in rounds over the cells of a grid, the best remaining one of each cell.
 
     Args:
         uv: Pixel coordinates (right, down).
-        score: The greater, the better.
-        valid: Which points exist.
+        score: Quality; greater is better.
+        valid: Points that exist.
         shape: Static image size (rows, columns), px.
         grid: Static number of cells (rows, columns).
         capacity: Static number of slots of the result.
-        per_cell: No cell gives more than this; None lets full cells backfill for empty ones.
+        per_cell: Greatest number of points of a cell; None lets full cells make up for empty ones.
 
     Returns:
-        Indices in the order of the turns: the first slots are spread as evenly as all of them.
+        Indices in the order of the rounds: the first slots are distributed as evenly as all of them.
 
     References:
-        The grid that evens out features [T-70].
+        Even distribution of features by a grid [T-70].
 
     Example:
         >>> import jax.numpy as jnp
         >>> uv = jnp.array([[1.0, 1.0], [2.0, 1.0], [9.0, 9.0]])
-        >>> chosen = spread(uv, jnp.array([3.0, 2.0, 1.0]), jnp.ones(3, bool), shape=(10, 10), grid=(2, 2), capacity=2)
-        >>> chosen.index.tolist()
+        >>> score, valid = jnp.array([3.0, 2.0, 1.0]), jnp.ones(3, bool)
+        >>> select_by_grid(uv, score, valid, shape=(10, 10), grid=(2, 2), capacity=2).index.tolist()
         [0, 2]
     """
     n = uv.shape[0]
@@ -108,7 +108,7 @@ def local_peaks(
     """The strongest local maxima of each cell of a grid.
 
     Args:
-        response: A response image, for example of `corners.harris`.
+        response: A response image, for example of `harris.harris`.
         grid: Static number of cells (rows, columns).
         per_cell: Static number of maxima a cell.
         radius: A maximum exceeds or equals all pixels within this many rows and columns.
@@ -118,7 +118,7 @@ def local_peaks(
         `rows * columns * per_cell` slots, cell by cell, strongest first.
 
     References:
-        The grid that evens out features [T-70].
+        Even distribution of features by a grid [T-70].
 
     Example:
         >>> import jax.numpy as jnp
@@ -136,8 +136,8 @@ def _local_peaks(response, grid: tuple[int, int], per_cell: int, radius: int, th
     highest = lax.reduce_window(response, -jnp.inf, lax.max, (side, side), (1, 1), "SAME")
     peak = (response >= highest) & (response > threshold)
     height, width = -(-response.shape[0] // grid[0]), -(-response.shape[1] // grid[1])
-    room = ((0, height * grid[0] - response.shape[0]), (0, width * grid[1] - response.shape[1]))
-    blocks = jnp.pad(jnp.where(peak, response, -jnp.inf), room, constant_values=-jnp.inf)
+    padding = ((0, height * grid[0] - response.shape[0]), (0, width * grid[1] - response.shape[1]))
+    blocks = jnp.pad(jnp.where(peak, response, -jnp.inf), padding, constant_values=-jnp.inf)
     blocks = blocks.reshape(grid[0], height, grid[1], width).transpose(0, 2, 1, 3).reshape(-1, height * width)
     best, at = lax.top_k(blocks, min(per_cell, height * width))
     cell = jnp.arange(grid[0] * grid[1], dtype=at.dtype)[:, None]
@@ -151,11 +151,11 @@ def _local_peaks(response, grid: tuple[int, int], per_cell: int, radius: int, th
 def coverage(
     uv: Float[Array, "n 2"], valid: Bool[Array, " n"], *, shape: tuple[int, int], grid: tuple[int, int]
 ) -> Coverage:
-    """Measures how evenly points cover an image: `entropy = -sum p log p / log(cells)` of the shares p of the cells.
+    """Evenness of points over an image, `entropy = -sum p log p / log(cells)` of the fractions p of points in cells.
 
     Args:
         uv: Pixel coordinates (right, down).
-        valid: Which points exist.
+        valid: Points that exist.
         shape: Static image size (rows, columns), px.
         grid: Static number of cells (rows, columns).
 
@@ -176,13 +176,13 @@ def coverage(
     counts = jnp.zeros(total, dtype=jnp.int32).at[cell].add(1, mode="drop")
     some = counts > 0
     share = counts.astype(uv.dtype) / jnp.maximum(counts.sum(), 1).astype(uv.dtype)
-    surprise = jnp.where(some, -share * jnp.log(jnp.where(some, share, 1.0)), 0.0)
-    entropy = surprise.sum() / jnp.log(jnp.asarray(max(total, 2), uv.dtype))
+    terms = jnp.where(some, -share * jnp.log(jnp.where(some, share, 1.0)), 0.0)
+    entropy = terms.sum() / jnp.log(jnp.asarray(max(total, 2), uv.dtype))
     return Coverage(counts.reshape(grid), some.astype(uv.dtype).mean(), entropy)
 
 
 def cells(uv: Float[Array, "n 2"], *, shape: tuple[int, int], grid: tuple[int, int]) -> Int[Array, " n"]:
-    """Row-major number of the grid cell that each pixel lies in; pixels outside count to the nearest cell.
+    """Row-major number of the grid cell of each pixel; pixels outside belong to the nearest cell.
 
     Example:
         >>> import jax.numpy as jnp
@@ -203,15 +203,15 @@ def cover_squares(
     shape: tuple[int, int],
     capacity: int,
 ) -> Selection:
-    """Chooses points that keep a distance, the greatest one that still fills the slots.
+    """Selects points at least half a square apart, with the greatest square that still fills the slots (SSC).
 
-    Points are taken from the strongest on; each forbids the square around it. The side of the square is found by
-    halving, so that at least `capacity` points are left, and the strongest of those are kept.
+    Points are visited by decreasing score; each suppresses weaker ones in the square around it. The side of the square
+    is found by bisection, so that at least `capacity` points are left, and the strongest of those are kept.
 
     Args:
         uv: Pixel coordinates (right, down).
-        score: The greater, the better.
-        valid: Which points exist.
+        score: Quality; greater is better.
+        valid: Points that exist.
         shape: Static image size (rows, columns), px.
         capacity: Static number of slots of the result.
 
@@ -220,7 +220,7 @@ def cover_squares(
 
     References:
         Bailo, Rameau, Joo, Park, Bogdan, Kweon, "Efficient adaptive non-maximal suppression algorithms for homogeneous
-        spatial keypoint distribution", Pattern Recognition Letters 2018 (SSC), which halves as well.
+        spatial keypoint distribution", Pattern Recognition Letters 2018 (SSC).
 
     Example:
         >>> import jax.numpy as jnp
@@ -231,29 +231,29 @@ def cover_squares(
     n = uv.shape[0]
     order = jnp.lexsort((-score, ~valid)).astype(jnp.int32)
     places = jnp.where(valid[:, None], lax.stop_gradient(uv), 0.0)[order]
-    alive = valid[order]
+    present = valid[order]
 
-    def halve(_: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def bisect(_: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         low, high, best = state
         side = 0.5 * (low + high)
-        kept = _kept(places, alive, side)
+        kept = _kept(places, present, side)
         enough = jnp.sum(kept) >= min(capacity, n)
         return jnp.where(enough, side, low), jnp.where(enough, high, side), jnp.where(enough, kept, best)
 
     far = jnp.asarray(float(max(shape)), uv.dtype)
-    _, _, best = lax.fori_loop(0, _HALVINGS, halve, (jnp.zeros_like(far), far, alive))
+    _, _, best = lax.fori_loop(0, _BISECTIONS, bisect, (jnp.zeros_like(far), far, present))
     rank = jnp.argsort(~best, stable=True)[:capacity]
     chosen = jnp.pad(best[rank], (0, max(capacity - n, 0)))
     index = jnp.pad(order[rank], (0, max(capacity - n, 0)))
     return Selection(jnp.where(chosen, index, 0), chosen)
 
 
-def _kept(places: Float[Array, "n 2"], alive: Bool[Array, " n"], side: Float[Array, ""]) -> Bool[Array, " n"]:
-    """Points that remain when each that is kept forbids weaker ones less than half a side away along both axes."""
+def _kept(places: Float[Array, "n 2"], present: Bool[Array, " n"], side: Float[Array, ""]) -> Bool[Array, " n"]:
+    """Points that remain when each kept one suppresses weaker ones within half a side along both axes."""
 
     def visit(free: Array, k: Array) -> tuple[Array, Array]:
         keep = free[k]
         near = jnp.max(jnp.abs(places - places[k][None, :]), axis=1) < 0.5 * side
         return free & ~(keep & near), keep
 
-    return lax.scan(visit, alive, jnp.arange(places.shape[0], dtype=jnp.int32))[1]
+    return lax.scan(visit, present, jnp.arange(places.shape[0], dtype=jnp.int32))[1]

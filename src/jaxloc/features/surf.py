@@ -1,6 +1,6 @@
-"""SURF: blobs by box filters, their orientation by Haar wavelets, descriptors of 64 numbers, in JAX.
+"""SURF features: blobs by box filters, orientations and descriptors by Haar wavelets, in JAX.
 
-All is read from one integral image. The wheel of OpenCV has no SURF.
+All filters use one integral image. OpenCV's standard wheel has no SURF.
 
 References:
     Bay, Ess, Tuytelaars, Van Gool, "Speeded-up robust features (SURF)", CVIU 2008.
@@ -15,24 +15,25 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc.features.keypoints import Descriptors, Keypoints
-from jaxloc.features.scale_space.box_hessian import box_hessian, filter_sizes, octaves_that_fit, scale_of
+from jaxloc.features.scale_space.box_hessian import box_hessian, filter_scale, filter_sizes, max_octaves
 from jaxloc.features.scale_space.extrema import ExtremumTest, find_extrema
-from jaxloc.features.scale_space.orientation import disc, dominant_direction, turned, unit_rows
+from jaxloc.features.scale_space.orientation import disc_offsets, dominant_direction, normalize_rows, rotate_gradients
+from jaxloc.features.scale_space.sampling import oriented_grid
 from jaxloc.images.integral import filter_boxes
 
-# All in scales of the keypoint: radius of the orientation and deviation of its Gaussian; samples along a side of the
-# descriptor, cells along a side, deviation of its Gaussian.
-_RADIUS, _SPREAD = 6, 2.0
+# In scales of the keypoint: radius of the orientation's neighborhood, standard deviation of its Gaussian; samples and
+# cells along a side of the descriptor, standard deviation of its Gaussian.
+_RADIUS, _SIGMA = 6, 2.0
 _SAMPLES, _CELLS, _WINDOW = 20, 4, 3.3
 
 
 class Surf(eqx.Module):
-    """What SURF looks for.
+    """Options of SURF.
 
     Attributes:
-        octaves: most octaves; as many as the image has room for.
-        least_response: least determinant of a keypoint, as a share of 255^2.
-        upright: all keypoints point to the right: for cameras that do not roll.
+        octaves: greatest number of octaves; fewer in small images.
+        least_response: threshold of the determinant, as a fraction of 255^2.
+        upright: orientation zero for all keypoints: for cameras that do not roll.
     """
 
     octaves: int = eqx.field(static=True, default=4)
@@ -42,12 +43,12 @@ class Surf(eqx.Module):
 
 @eqx.filter_jit
 def surf(image: Float[Array, "h w"], *, options: Surf = Surf(), capacity: int = 1000) -> tuple[Keypoints, Descriptors]:
-    """Keypoints with scale, orientation and sign of the Laplacian, and their descriptors.
+    """SURF keypoints with scale, orientation and sign of the Laplacian, and their descriptors.
 
     Args:
         image: gray levels 0-255.
-        options: what to look for.
-        capacity: keypoints that are kept, the strongest first.
+        options: octaves and thresholds.
+        capacity: greatest number of keypoints, the strongest first.
 
     Returns:
         Keypoints (``size`` is the side of the box filter, 7.5 scales, and ``layer`` the sign of the Laplacian: 1 on
@@ -68,7 +69,7 @@ def surf(image: Float[Array, "h w"], *, options: Surf = Surf(), capacity: int = 
     uv, size, value, sign, valid = _strongest(image, options, capacity)
     angle = jnp.zeros_like(size)
     if not options.upright:
-        direction = dominant_direction(*_slopes_around(image, uv, jnp.where(valid, scale_of(size), 1.0)))
+        direction = dominant_direction(*_haar_responses(image, uv, jnp.where(valid, filter_scale(size), 1.0)))
         angle = jnp.where(valid & direction.ok, direction.angle, 0.0)
     none = jnp.zeros(valid.shape, jnp.int32)
     keypoints = Keypoints(uv, size, angle, value, none, sign, valid, "surf")
@@ -77,9 +78,9 @@ def surf(image: Float[Array, "h w"], *, options: Surf = Surf(), capacity: int = 
 
 @eqx.filter_jit
 def describe_surf(image: Float[Array, "h w"], keypoints: Keypoints) -> Descriptors:
-    """SURF's descriptors of any keypoints with a size and an angle.
+    """SURF descriptors of given keypoints with size and orientation.
 
-    Haar responses on a grid of 20 x 20 samples, turned and scaled with the keypoint, under a Gaussian, are summed in
+    Haar responses on a grid of 20 x 20 samples, rotated and scaled with the keypoint, under a Gaussian, are summed in
     4 x 4 cells: ``sum d_u, sum d_v, sum |d_u|, sum |d_v|``.
 
     Args:
@@ -104,16 +105,16 @@ def describe_surf(image: Float[Array, "h w"], keypoints: Keypoints) -> Descripto
 
 @eqx.filter_jit
 def laplacian_gate(first: Keypoints, second: Keypoints) -> Bool[Array, "n m"]:
-    """Pairs of SURF's keypoints that may match: both dark on bright, or both bright on dark.
+    """Pairs of SURF keypoints whose signs of the Laplacian agree: both dark on bright, or both bright on dark.
 
-    The sign comes with the detection, so that about half of all candidates are left out at no cost.
+    The sign is known from detection, so that about half of all candidates are excluded at no cost.
 
     Args:
         first: keypoints of `surf`.
         second: keypoints of `surf`.
 
     Returns:
-        True where the pair may match: the `gate` of `images.match.match`.
+        True where the pair may match: the `gate` of `features.match.match`.
 
     References:
         Bay et al. 2008, section 4.3 [T-40].
@@ -129,9 +130,9 @@ def laplacian_gate(first: Keypoints, second: Keypoints) -> Bool[Array, "n m"]:
 
 
 def _strongest(image: Array, options: Surf, capacity: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Places, sizes, responses, signs of the Laplacian and validity of the strongest blobs of all octaves."""
+    """Positions, sizes, responses, signs of the Laplacian and validity of the strongest blobs of all octaves."""
     least, parts = 255.0**2 * options.least_response, []
-    for octave in range(octaves_that_fit(image.shape, options.octaves)):
+    for octave in range(max_octaves(image.shape, options.octaves)):
         found = box_hessian(image, octave=octave)
         # The largest filter lies within the image; a ridge of the determinant is no edge of the image.
         sizes = filter_sizes(octave)
@@ -148,39 +149,36 @@ def _strongest(image: Array, options: Surf, capacity: int) -> tuple[Array, Array
     return uv[best], jnp.where(valid, size[best], 0.0), value[best], sign, valid
 
 
-def _slopes_around(image: Array, uv: Float[Array, "n 2"], scale: Float[Array, " n"]) -> tuple[Array, Array]:
+def _haar_responses(image: Array, uv: Float[Array, "n 2"], scale: Float[Array, " n"]) -> tuple[Array, Array]:
     """Haar responses on a disc of six scales about each keypoint, under a Gaussian."""
-    columns, rows = (np.array(side) for side in disc(_RADIUS))
-    weight = jnp.asarray(np.exp(-0.5 * (columns**2 + rows**2) / _SPREAD**2), scale.dtype)[None, :]
+    columns, rows = (np.array(side) for side in disc_offsets(_RADIUS))
+    weight = jnp.asarray(np.exp(-0.5 * (columns**2 + rows**2) / _SIGMA**2), scale.dtype)[None, :]
     across, down = (jnp.asarray(side, scale.dtype)[None, :] * scale[:, None] for side in (columns, rows))
     right, lower = _haar(image, uv[:, :1] + across, uv[:, 1:] + down, 2.0 * scale)
     return weight * right, weight * lower
 
 
 def _describe(image: Array, keypoints: Keypoints) -> Descriptors:
-    scale = jnp.where(keypoints.valid, jnp.maximum(scale_of(keypoints.size), 0.5), 1.0)
+    scale = jnp.where(keypoints.valid, jnp.maximum(filter_scale(keypoints.size), 0.5), 1.0)
     side = np.arange(_SAMPLES) - 0.5 * (_SAMPLES - 1)
     rows, columns = (axis.reshape(-1) for axis in np.meshgrid(side, side, indexing="ij"))
-    across, down = (jnp.asarray(axis, scale.dtype)[None, :] for axis in (columns, rows))
-    cos, sin = (f(keypoints.angle)[:, None] * scale[:, None] for f in (jnp.cos, jnp.sin))
-    u = keypoints.uv[:, :1] + cos * across - sin * down
-    v = keypoints.uv[:, 1:] + sin * across + cos * down
-    along, aside = turned(*_haar(image, u, v, scale), keypoints.angle)
+    u, v = oriented_grid(keypoints.uv, keypoints.angle, scale, columns, rows)
+    along, across = rotate_gradients(*_haar(image, u, v, scale), keypoints.angle)
     window = jnp.asarray(np.exp(-0.5 * (columns**2 + rows**2) / _WINDOW**2), scale.dtype)[None, :]
-    along, aside = window * along, window * aside
+    along, across = window * along, window * across
     cell = np.arange(_SAMPLES) // (_SAMPLES // _CELLS)
     member = (cell[:, None] == np.arange(_CELLS)[None, :]).astype(float)
     cells = jnp.asarray(np.kron(member, member), scale.dtype)
-    sums = [part @ cells for part in (along, aside, jnp.abs(along), jnp.abs(aside))]
-    values = unit_rows(jnp.stack(sums, axis=2).reshape(len(scale), -1))
+    sums = [part @ cells for part in (along, across, jnp.abs(along), jnp.abs(across))]
+    values = normalize_rows(jnp.stack(sums, axis=2).reshape(len(scale), -1))
     valid = keypoints.valid & (jnp.sum(sums[2] + sums[3], axis=1) > 0)
     return Descriptors(jnp.where(valid[:, None], values, 0.0), valid)
 
 
 def _haar(image: Array, u: Float[Array, "n k"], v: Float[Array, "n k"], half: Float[Array, " n"]) -> tuple:
-    """Differences of the right and left, lower and upper half of a square; zero where it leaves the image.
+    """Haar wavelets: differences of the halves of a square, right less left and lower less upper; zero outside.
 
-    The square is a whole number of pixels wide and lies between pixels: it is exact on whole pixels and linear between.
+    The width is a whole number of pixels; between whole pixels the responses are interpolated.
     """
     height, width = image.shape
     reach = jnp.clip(jnp.round(lax.stop_gradient(half)), 1.0, 0.5 * min(height, width)).astype(jnp.int32)[:, None]
@@ -203,7 +201,7 @@ def _haar(image: Array, u: Float[Array, "n k"], v: Float[Array, "n k"], half: Fl
 def _differences(
     sums: Array, middle: Int[Array, "n k"], reach: Int[Array, "n 1"], *, width: int
 ) -> tuple[Array, Array]:
-    """Haar sums about four neighboring places, read as rows of four numbers."""
+    """Haar sums about four neighboring places, gathered as rows of four numbers."""
     four = jnp.stack([sums[:-1, :-1], sums[:-1, 1:], sums[1:, :-1], sums[1:, 1:]], axis=2).reshape(-1, 4)
     corner = {(a, b): four[middle + (a * width + b) * reach] for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b}
     left, middle, right = (corner[1, b] - corner[-1, b] for b in (-1, 0, 1))

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc.features import subpixel
-from jaxloc.features.opencv import library
+from jaxloc.features.opencv import backend
 
 # Cost where a window leaves the other image.
 _OUTSIDE = 1e9
@@ -186,7 +186,7 @@ class SemiGlobal(Matcher):
             ImportError: OpenCV is not installed.
         """
         penalty = self.size**2
-        matcher = library.load().StereoSGBM_create(
+        matcher = backend.load().StereoSGBM_create(
             minDisparity=0,
             numDisparities=self.num_disparities,
             blockSize=self.size,
@@ -197,7 +197,7 @@ class SemiGlobal(Matcher):
             speckleWindowSize=100,
             speckleRange=2,
         )
-        found = matcher.compute(library.gray_bytes(left), library.gray_bytes(right)).astype(np.float32) / 16.0
+        found = matcher.compute(backend.to_uint8(left), backend.to_uint8(right)).astype(np.float32) / 16.0
         valid = found > 0
         variance = np.where(valid, self.sigma**2, 1.0).astype(np.float32)
         return DisparityMap(jnp.asarray(np.where(valid, found, 0.0)), jnp.asarray(variance), jnp.asarray(valid))

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc._linalg import matmul
+from jaxloc._tree import detach_unless
 from jaxloc.images import Homography
 from jaxloc.poses import SE3, Direction
 from jaxloc.sensors import Pinhole
-from jaxloc.solvers import Estimate, LevenbergMarquardt, Loss, Problem, Quadratic, Tukey, ransac, solve
+from jaxloc.solvers import Estimate, LevenbergMarquardt, Loss, Problem, Quadratic, RobustEstimate, Tukey, ransac, solve
 
 # 99 % of the squared distance of two whitened components, as a distance.
 _GATE = 3.035
@@ -239,24 +240,24 @@ def estimate_homography(
     valid: Bool[Array, " n"] | None = None,
     hypotheses: int = 128,
     loss: Loss | None = None,
-) -> Estimate:
-    """Homography between two images of a plane (or of a turning camera), among false correspondences.
+) -> RobustEstimate:
+    """Homography between two images of a plane (or of a rotating camera), from correspondences with outliers.
 
-    Samples of four points vote (MSAC on the whitened transfer error); the winner is refitted to its inliers and then
-    refined on SL(3) under a robust kernel over all correspondences.
+    RANSAC over samples of four points (MSAC on the whitened transfer error); the best model is refitted to its inliers
+    and then refined on SL(3) under a robust kernel over all correspondences.
 
     Args:
         first: points of the first image, px.
-        second: their partners in the second, px.
+        second: the corresponding points of the second, px.
         key: random key.
         sigma: standard deviation of a coordinate in either image, px.
-        valid: which count; numbers that are not finite never do.
+        valid: correspondences that are used; non-finite ones never are.
         hypotheses: number of samples; static.
         loss: kernel of the refinement, in sigmas; Tukey's of 95 % efficiency if None.
 
     Returns:
-        Estimate of `Homography`. ``ok`` is False when no homography explains more than four points, or points lie on a
-        line.
+        Estimate of `Homography`, and which pairs agree with it. ``ok`` is False when no homography explains more than
+        four points, or points lie on a line.
 
     Raises:
         ValueError: fewer than four correspondences.
@@ -283,7 +284,7 @@ def estimate_homography(
     loss = Tukey(jnp.asarray(_TUKEY, first.dtype)) if loss is None else loss
     fit = solve(TransferError(first.T, second.T, sigma, valid, loss), start, solver=LevenbergMarquardt())
     inliers = valid & (_distance(jax.lax.stop_gradient(fit.value), data) < _GATE)
-    return _believed_if(fit, found.ok & (jnp.sum(inliers) > _SAMPLE))
+    return _validate(fit, found.ok & (jnp.sum(inliers) > _SAMPLE), inliers)
 
 
 def _refitted(model: Homography, data: Any, inliers: Array, valid: Array) -> Homography:
@@ -294,7 +295,6 @@ def _refitted(model: Homography, data: Any, inliers: Array, valid: Array) -> Hom
     return Homography(jnp.where(better, again.homogeneous, model.homogeneous))
 
 
-def _believed_if(fit: Estimate, condition: Bool[Array, ""]) -> Estimate:
+def _validate(fit: Estimate, condition: Bool[Array, ""], inliers: Bool[Array, " n"]) -> RobustEstimate:
     ok = fit.ok & condition
-    value = jax.tree.map(lambda leaf: jnp.where(ok, leaf, jax.lax.stop_gradient(leaf)), fit.value)
-    return eqx.tree_at(lambda e: (e.value, e.ok), fit, (value, ok))
+    return RobustEstimate(eqx.tree_at(lambda e: (e.value, e.ok), fit, (detach_unless(ok, fit.value), ok)), inliers)

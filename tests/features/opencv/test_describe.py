@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from jaxloc.features.keypoints import Keypoints
-from jaxloc.features.opencv.describe import describe
-from jaxloc.features.opencv.detect import AKAZE, FAST, KAZE, ORB, SIFT, ShiTomasi, detect
+from jaxloc.features.opencv import AKAZE, FAST, KAZE, ORB, SIFT, ShiTomasi, describe, detect
 
 KINDS = [ORB(), SIFT(), KAZE(), AKAZE()]
 IDS = [type(kind).__name__ for kind in KINDS]

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from jaxloc.features.keypoints import Keypoints
-from jaxloc.features.opencv import library
-from jaxloc.features.opencv.detect import AKAZE, FAST, KAZE, ORB, SIFT, Harris, ShiTomasi, detect
+from jaxloc.features.opencv import AKAZE, FAST, KAZE, ORB, SIFT, Harris, ShiTomasi, backend, detect
 from jaxloc.features.select import coverage
 
 KINDS = [ORB(), SIFT(), FAST(), Harris(), ShiTomasi(), KAZE(), AKAZE()]
@@ -113,7 +112,7 @@ def test_a_missing_detector_is_one_clear_error(rng, monkeypatch):
 
     # OpenCV 5 keeps it in the contrib module.
     monkeypatch.setattr(cv2, "xfeatures2d", Contrib, raising=False)
-    assert library.create("KAZE").descriptorSize() == 32
+    assert backend.create("KAZE").descriptorSize() == 32
 
 
 def test_wrong_options_are_refused(rng):
@@ -127,7 +126,7 @@ def test_wrong_options_are_refused(rng):
 
 
 def test_gray_bytes_survive_bad_numbers():
-    got = library.gray_bytes(np.array([[np.nan, np.inf, -np.inf, 300.0, -4.0, 7.5]]))
+    got = backend.to_uint8(np.array([[np.nan, np.inf, -np.inf, 300.0, -4.0, 7.5]]))
     assert got.tolist() == [[0, 255, 0, 255, 0, 8]]
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 from skimage.feature import hessian_matrix_det
 
-from jaxloc.features.scale_space.box_hessian import box_hessian, filter_sizes, octaves_that_fit, scale_of
+from jaxloc.features.scale_space.box_hessian import box_hessian, filter_scale, filter_sizes, max_octaves
 
 
 def kernels(size):
@@ -54,7 +54,7 @@ def test_equal_scikit_image(picture, x64):
 def test_sizes_of_the_paper():
     sizes = [list(filter_sizes(octave)) for octave in range(4)]
     assert sizes == [[9, 15, 21, 27], [15, 27, 39, 51], [27, 51, 75, 99], [51, 99, 147, 195]]
-    assert [octaves_that_fit((n, 2 * n), 4) for n in (30, 60, 120, 250, 999)] == [1, 2, 3, 4, 4]
+    assert [max_octaves((n, 2 * n), 4) for n in (30, 60, 120, 250, 999)] == [1, 2, 3, 4, 4]
 
 
 def test_weight_makes_up_for_the_boxes():
@@ -79,7 +79,7 @@ def test_near_the_true_determinant(picture, x64, layer, least):  # T-37
         return np.corrcoef(truth, found)[0, 1]
 
     assert likeness(size / 6) > least
-    assert likeness(float(scale_of(jnp.asarray([float(size)]))[0])) < likeness(size / 6)
+    assert likeness(float(filter_scale(jnp.asarray([float(size)]))[0])) < likeness(size / 6)
 
 
 def test_derivatives_equal_differences(picture, x64):

@@ -48,12 +48,12 @@ def test_flat_extrema_are_those_of_each_layer(x64, rng):
     stack = np.stack(
         [paraboloid((2.0, 9.4, 11.7))[2], np.zeros(SHAPE[1:]), paraboloid((2.0, 12.2, 20.4), height=5.0)[2]]
     )
-    found = first(stack, flat=True)
+    found = first(stack, within_layer=True)
     assert found.valid.tolist() == [True, True] + 4 * [False]
     np.testing.assert_allclose(found.place[:2], [[0.0, 9.4, 11.7], [2.0, 12.2, 20.4]], atol=1e-9)
     np.testing.assert_allclose(found.value[:2], [9.0, 5.0], atol=1e-9)
     noise = rng.normal(size=SHAPE)
-    test = ExtremumTest(0.5, 1e9, flat=True)
+    test = ExtremumTest(0.5, 1e9, within_layer=True)
     together = find_extrema(jnp.asarray(noise), test, capacity=400)
     alone = [find_extrema(jnp.asarray(layer[None]), test, capacity=400) for layer in noise]
     assert int(together.valid.sum()) == sum(int(found.valid.sum()) for found in alone) > 0

@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from jaxloc.data import DataError
 from jaxloc.data.io.writing import write_file
 from jaxloc.data.road_images import LaneFrame, LaneRecording
-from jaxloc.features.opencv.library import load
+from jaxloc.features.opencv.backend import load
 
 _SEEN, _PREDICTED, _WARNING = (80, 200, 0), (0, 140, 255), (0, 0, 255)  # blue, green, red
 _WARN = 1.0  # s before a line is crossed

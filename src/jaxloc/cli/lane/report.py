@@ -8,7 +8,7 @@ from jaxtyping import UInt8
 from jaxloc.cli import results
 from jaxloc.data.road_images import LaneRecording
 from jaxloc.evaluation import plots, report
-from jaxloc.features.opencv.library import load
+from jaxloc.features.opencv.backend import load
 
 _MOST_PICTURES = 12
 _SMALL = 480  # columns of an image in the report

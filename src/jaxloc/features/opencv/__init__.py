@@ -1,6 +1,7 @@
 """Detectors and descriptors of OpenCV, on the host."""
 
-from jaxloc.features.opencv import chessboard, detectors, library
+from jaxloc.features.opencv import backend, chessboard, detectors
+from jaxloc.features.opencv.backend import create, load, to_uint8
 from jaxloc.features.opencv.chessboard import board_points, find_chessboard
 from jaxloc.features.opencv.describe import describe
 from jaxloc.features.opencv.detect import detect
@@ -18,7 +19,6 @@ from jaxloc.features.opencv.detectors import (
     ShiTomasi,
     from_opencv,
 )
-from jaxloc.features.opencv.library import create, gray_bytes, load
 
 __all__ = [
     "AKAZE",
@@ -32,6 +32,7 @@ __all__ = [
     "ORB",
     "SIFT",
     "ShiTomasi",
+    "backend",
     "board_points",
     "chessboard",
     "create",
@@ -40,7 +41,6 @@ __all__ = [
     "detectors",
     "find_chessboard",
     "from_opencv",
-    "gray_bytes",
-    "library",
+    "to_uint8",
     "load",
 ]

@@ -1,26 +1,26 @@
-"""Inner corners of a chessboard in an image, by OpenCV on the host."""
+"""Detection of the inner corners of a chessboard, by OpenCV on the host."""
 
 import numpy as np
 from jaxtyping import Array, Float64, Num
 
-from jaxloc.features.opencv.library import gray_bytes, load
+from jaxloc.features.opencv.backend import load, to_uint8
 
-_SHARE = 0.4  # of the distance to the nearest corner: the half window that holds one corner alone
-_LEAST, _MOST = 2, 11
+_WINDOW_RATIO = 0.4  # half-width of the window over the distance of neighboring corners
+_LEAST, _MOST = 2, 11  # half-width of the window, px
 
 
 def find_chessboard(image: Num[np.ndarray | Array, "h w"], grid: tuple[int, int]) -> Float64[np.ndarray, "m 2"] | None:
-    """Finds all inner corners of a chessboard, to parts of a pixel.
+    """Finds all inner corners of a chessboard with subpixel accuracy.
 
-    Each corner is moved to where the gradients of its surroundings are orthogonal to the way from it; the window
-    suits the smallest square, so that it holds no other corner.
+    Each corner is refined so that the gradients in a window are orthogonal to the lines to the corner; the window is
+    so small that it contains no other corner.
 
     Args:
-        image: Gray image: bytes, or other numbers as gray levels 0-255 (0-1 if no value exceeds 1).
+        image: Grayscale image: uint8, or other types as gray levels 0-255 (0-1 if no value exceeds 1).
         grid: Inner corners along the rows of the board, and down: `(9, 6)` for 10 by 7 squares.
 
     Returns:
-        Pixels (u, v), row of the board by row; None when the board is not seen as a whole.
+        Pixels (u, v), row by row of the board; None when the board is not completely visible.
 
     Raises:
         ValueError: The grid has less than 3 corners in a direction.
@@ -40,7 +40,7 @@ def find_chessboard(image: Num[np.ndarray | Array, "h w"], grid: tuple[int, int]
     """
     if min(grid) < 3:
         raise ValueError(f"The board has {grid[0]}x{grid[1]} inner corners; at least 3 each way can be found.")
-    cv2, pixels = load(), gray_bytes(image)
+    cv2, pixels = load(), to_uint8(image)
     if min(pixels.shape) < 4 * min(grid):
         return None
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -48,7 +48,7 @@ def find_chessboard(image: Num[np.ndarray | Array, "h w"], grid: tuple[int, int]
     if not found or rough is None or len(rough) != grid[0] * grid[1]:
         return None
     spacing = _spacing(rough.reshape(grid[1], grid[0], 2))
-    half = int(np.clip(_SHARE * spacing, _LEAST, _MOST))
+    half = int(np.clip(_WINDOW_RATIO * spacing, _LEAST, _MOST))
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
     fine = cv2.cornerSubPix(pixels, rough.copy(), (half, half), (-1, -1), stop)
     moved = np.linalg.norm(fine - rough, axis=-1)

@@ -5,8 +5,8 @@ import numpy as np
 from jaxtyping import Array, Num
 
 from jaxloc.features.keypoints import Descriptors, Keypoints
+from jaxloc.features.opencv.backend import load, to_uint8
 from jaxloc.features.opencv.detectors import AbstractFeature
-from jaxloc.features.opencv.library import gray_bytes, load
 
 
 def describe(kind: AbstractFeature, image: Num[np.ndarray | Array, "h w"], keypoints: Keypoints) -> Descriptors:
@@ -17,25 +17,25 @@ def describe(kind: AbstractFeature, image: Num[np.ndarray | Array, "h w"], keypo
 
     Args:
         kind: The descriptor: `ORB()`, `SIFT()`, `KAZE()` or `AKAZE()`.
-        image: Gray image: bytes, or other numbers as gray levels 0-255 (0-1 if no value exceeds 1).
-        keypoints: Where to describe.
+        image: Grayscale image: uint8, or other types as gray levels 0-255 (0-1 if no value exceeds 1).
+        keypoints: Of the image.
 
     Returns:
         One descriptor a keypoint: float32 numbers for SIFT and KAZE, packed bits (uint8) for ORB and A-KAZE. A keypoint
-        whose neighborhood leaves the image (OpenCV drops those) keeps its place and is not valid.
+        whose neighborhood leaves the image (OpenCV drops those) keeps its slot and is not valid.
 
     Raises:
         ImportError: This OpenCV lacks the descriptor (KAZE and A-KAZE since 5.0).
 
     Example:
         >>> import numpy as np
-        >>> from jaxloc.features.opencv.detect import ORB, detect
+        >>> from jaxloc.features.opencv import ORB, detect
         >>> image = np.random.default_rng(0).integers(0, 255, (120, 160), dtype=np.uint8)
         >>> keypoints = detect(ORB(), image, capacity=20)
         >>> describe(ORB(), image, keypoints).values.shape
         (20, 32)
     """
-    pixels = gray_bytes(image)
+    pixels = to_uint8(image)
     capacity = keypoints.valid.shape[0]
     extractor = kind.extractor(capacity)
     binary = extractor.descriptorType() == load().CV_8U
@@ -60,9 +60,9 @@ def _compute(kind: AbstractFeature, extractor, pixels: np.ndarray, keypoints: Ke
     uv = np.asarray(keypoints.uv)[slots].astype(float)
     octave = np.asarray(keypoints.octave)[slots] if native else np.zeros(len(slots), int)
     # A-KAZE and KAZE read their scale level from the class number and drop nothing; ORB drops what is near the
-    # border and carries the number along, so that it can hold the slot.
+    # border and keeps the class number, which holds the slot.
     levels = type(kind).__name__ in ("KAZE", "AKAZE")
-    # The lowest level of KAZE has no derivatives: descriptors made there are not numbers.
+    # The lowest level of KAZE has no derivatives: descriptors of it are NaN.
     layer = np.asarray(keypoints.layer)[slots] if native else np.full(len(slots), int(type(kind).__name__ == "KAZE"))
     columns = (
         uv[:, 0],

@@ -1,25 +1,12 @@
-"""Keypoint detection by OpenCV on the host: any detector, evenly spread, padded to a fixed size."""
+"""Keypoint detection by OpenCV on the host, evenly distributed over a grid and padded to a fixed size."""
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Num
 
 from jaxloc.features.keypoints import Keypoints
-from jaxloc.features.opencv.detectors import (
-    AKAZE,
-    FAST,
-    KAZE,
-    ORB,
-    SIFT,
-    AbstractDetector,
-    Candidates,
-    Harris,
-    ShiTomasi,
-    from_opencv,
-)
-from jaxloc.features.opencv.library import gray_bytes
-
-__all__ = ["AKAZE", "FAST", "KAZE", "ORB", "SIFT", "Harris", "ShiTomasi", "detect"]
+from jaxloc.features.opencv.backend import to_uint8
+from jaxloc.features.opencv.detectors import AbstractDetector, Candidates, from_opencv
 
 
 def detect(
@@ -30,14 +17,14 @@ def detect(
     *,
     mask: Bool[np.ndarray | Array, "_ _"] | None = None,
 ) -> Keypoints:
-    """Detects keypoints, spread evenly over the image (runs on the host, not under `jit`).
+    """Detects keypoints, evenly distributed over the image (runs on the host, not under `jit`).
 
-    Cells of the grid take turns, each giving its strongest remaining candidate, until the capacity is used: a full cell
-    backfills for an empty one, and the first slots are spread as evenly as all of them.
+    Candidates are taken in rounds over the cells of the grid, the strongest remaining one of each cell, until the
+    capacity is used: full cells make up for empty ones, and the first slots are distributed as evenly as all of them.
 
     Args:
         kind: The detector: `ORB()`, `SIFT()`, `FAST()`, `Harris()`, `ShiTomasi()`, `KAZE()` or `AKAZE()`.
-        image: Gray image: bytes, or other numbers as gray levels 0-255 (0-1 if no value exceeds 1).
+        image: Grayscale image: uint8, or other types as gray levels 0-255 (0-1 if no value exceeds 1).
         capacity: Number of slots.
         grid: Cells as (rows, columns); `(1, 1)` takes the strongest of the whole image.
         mask: True where keypoints may lie.
@@ -50,10 +37,11 @@ def detect(
         ValueError: Capacity or grid is not positive, or the mask has another shape.
 
     References:
-        The grid that evens out features [T-70].
+        Even distribution of features by a grid [T-70].
 
     Example:
         >>> import numpy as np
+        >>> from jaxloc.features.opencv import ShiTomasi
         >>> image = np.zeros((60, 80), np.uint8)
         >>> image[20:40, 30:50] = 200
         >>> keypoints = detect(ShiTomasi(), image, capacity=8)
@@ -64,18 +52,20 @@ def detect(
         raise ValueError(f"detect: capacity {capacity} and grid {grid} must be positive.")
     if mask is not None and tuple(mask.shape) != tuple(image.shape):
         raise ValueError(f"detect: the mask has shape {mask.shape}, the image {image.shape}; give one value a pixel.")
-    pixels = gray_bytes(image)
+    pixels = to_uint8(image)
     # Some detectors of OpenCV raise on images of a few pixels, none finds anything there.
     if min(pixels.shape) < 3:
         found = from_opencv(())
     else:
         found = kind.find(pixels, None if mask is None else np.asarray(mask).astype(np.uint8), capacity)
-    kept = _take_turns(found.uv, found.response, pixels.shape, grid)[:capacity]
+    kept = _order_by_cell_rank(found.uv, found.response, pixels.shape, grid)[:capacity]
     return _pack(found, kept, capacity, type(kind).__name__)
 
 
-def _take_turns(uv: np.ndarray, response: np.ndarray, shape: tuple[int, int], grid: tuple[int, int]) -> np.ndarray:
-    """Candidates in the order in which the cells give them: by rank within the cell, then by response."""
+def _order_by_cell_rank(
+    uv: np.ndarray, response: np.ndarray, shape: tuple[int, int], grid: tuple[int, int]
+) -> np.ndarray:
+    """Order of the candidates by rank within their cells, then by response."""
     row = np.clip(uv[:, 1] * (grid[0] / shape[0]), 0, grid[0] - 1).astype(np.int64)
     column = np.clip(uv[:, 0] * (grid[1] / shape[1]), 0, grid[1] - 1).astype(np.int64)
     by_response = np.argsort(-response, kind="stable")

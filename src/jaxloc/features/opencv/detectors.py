@@ -1,4 +1,4 @@
-"""Detectors and their options, as records; OpenCV does the work on the host."""
+"""OpenCV's detectors and their options, as records; they run on the host."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import equinox as eqx
 import numpy as np
 
-from jaxloc.features.opencv.library import create, load
+from jaxloc.features.opencv.backend import create, load
 
 
 @dataclass
 class Candidates:
-    """What a detector found on the host; all but position and response may be left in OpenCV's keypoints."""
+    """Detections on the host; fields other than position and response may stay in OpenCV's keypoints."""
 
     uv: np.ndarray
     response: np.ndarray
@@ -24,24 +24,24 @@ class AbstractDetector(eqx.Module):
 
     @abstractmethod
     def find(self, pixels: np.ndarray, mask: np.ndarray | None, capacity: int) -> Candidates:
-        """Finds candidates, more than `capacity` if there are, in an 8-bit image."""
+        """Detects candidates in an 8-bit image, more than `capacity` where possible."""
 
 
 class AbstractFeature(AbstractDetector):
     """A detector that OpenCV pairs with a descriptor of the same name.
 
     Attributes:
-        surplus: Candidates sought for each slot, so that the strongest corners do not starve the other cells.
+        surplus: Candidates for each slot, so that all cells have some.
     """
 
     surplus: eqx.AbstractClassVar[int]
 
     @abstractmethod
     def extractor(self, count: int):
-        """OpenCV's object for this feature."""
+        """OpenCV's feature object."""
 
     def find(self, pixels: np.ndarray, mask: np.ndarray | None, capacity: int) -> Candidates:
-        """Finds more keypoints than there are slots."""
+        """Detects more keypoints than there are slots."""
         return from_opencv(self.extractor(self.surplus * capacity).detect(pixels, mask))
 
 
@@ -52,7 +52,7 @@ class ORB(AbstractFeature):
         scale_factor: Ratio of neighboring pyramid levels.
         levels: Number of pyramid levels.
         fast_threshold: Least contrast of a corner, gray levels.
-        patch_size: Side of the described patch, px; the border of this width stays empty.
+        patch_size: Side of the described patch, px; no keypoint is nearer to the border.
 
     References:
         Rublee et al., "ORB: an efficient alternative to SIFT or SURF" (2011).
@@ -164,7 +164,7 @@ class AKAZE(AbstractFeature):
 
 
 class FAST(AbstractDetector):
-    """Segment-test corners at one scale: the cheapest detector.
+    """Segment-test corners at one scale; the fastest detector.
 
     Attributes:
         threshold: Least contrast between the center and its circle, gray levels.
@@ -179,12 +179,12 @@ class FAST(AbstractDetector):
         """Finds all corners that are maximal among their neighbors."""
         found = create("FastFeatureDetector", threshold=self.threshold).detect(pixels, mask)
         candidates = from_opencv(found)
-        # Every corner has the same size, angle and octave: there is nothing to read back.
+        # All corners have the same size, angle and octave.
         return Candidates(candidates.uv, candidates.response)
 
 
 class AbstractCorner(AbstractDetector):
-    """Local maxima of a corner response, found to a fraction of a pixel."""
+    """Local maxima of a corner response, with subpixel refinement."""
 
     block_size: eqx.AbstractVar[int]
     quality: eqx.AbstractVar[float]
@@ -216,7 +216,7 @@ class Harris(AbstractCorner):
     Attributes:
         k: Weight of the trace; 0.04 to 0.15.
         block_size: Side of the window that M is averaged over, px.
-        quality: Least response as a share of the greatest.
+        quality: Least response as a fraction of the greatest.
         radius: No other corner within this many pixels.
 
     References:
@@ -238,7 +238,7 @@ class ShiTomasi(AbstractCorner):
 
     Attributes:
         block_size: Side of the window that the tensor is averaged over, px.
-        quality: Least response as a share of the greatest.
+        quality: Least response as a fraction of the greatest.
         radius: No other corner within this many pixels.
 
     References:
@@ -268,11 +268,11 @@ def from_opencv(keypoints) -> Candidates:
 
 
 def _parabola_offsets(response: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Vertex of the parabola through three responses, along the row and along the column, at most half a pixel off."""
+    """Offsets of the vertex of a parabola through three responses along rows and columns, at most half a pixel."""
     center = response[rows, columns]
     offsets = []
     for down, right in ((0, 1), (1, 0)):
         before, after = response[rows - down, columns - right], response[rows + down, columns + right]
-        bend = np.maximum(2.0 * center - before - after, 1e-30)
-        offsets.append(np.clip(0.5 * (after - before) / bend, -0.5, 0.5))
+        curvature = np.maximum(2.0 * center - before - after, 1e-30)
+        offsets.append(np.clip(0.5 * (after - before) / curvature, -0.5, 0.5))
     return np.stack(offsets, axis=1).astype(np.float32)

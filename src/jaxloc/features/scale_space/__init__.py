@@ -1,57 +1,68 @@
-"""Gaussian and nonlinear scale spaces, their extrema and orientations."""
+"""Gaussian and nonlinear scale spaces, their extrema, orientations and sampling."""
 
-from jaxloc.features.scale_space import extrema, gaussian, nonlinear, orientation
-from jaxloc.features.scale_space.box_hessian import BoxHessian, box_hessian, filter_sizes, octaves_that_fit, scale_of
+from jaxloc.features.scale_space import extrema, gaussian, nonlinear, orientation, sampling
+from jaxloc.features.scale_space.box_hessian import BoxHessian, box_hessian, filter_scale, filter_sizes, max_octaves
 from jaxloc.features.scale_space.extrema import Extrema, ExtremumTest, find_extrema
 from jaxloc.features.scale_space.gaussian import Octave, ScaleSpace, difference_of_gaussians, double, laplacian, octaves
 from jaxloc.features.scale_space.nonlinear import (
-    DiffusedScaleSpace,
-    ExplicitCycle,
-    Samples,
-    Scheme,
-    Seat,
-    Splitting,
+    DiffusionScheme,
+    FastExplicitDiffusion,
+    NonlinearScaleSpace,
+    OperatorSplitting,
     Stack,
-    read,
-    samples_of,
-    seat_of,
-    stacks,
+    nonlinear_scale_space,
 )
-from jaxloc.features.scale_space.orientation import DominantDirection, disc, dominant_direction, turned, unit_rows
+from jaxloc.features.scale_space.orientation import (
+    DominantDirection,
+    disc_offsets,
+    dominant_direction,
+    normalize_rows,
+    rotate_gradients,
+)
+from jaxloc.features.scale_space.sampling import (
+    KeypointLayer,
+    LayerSamples,
+    concatenate_layers,
+    interpolate_layer,
+    nearest_layer,
+    oriented_grid,
+)
 
 __all__ = [
     "BoxHessian",
-    "DiffusedScaleSpace",
+    "DiffusionScheme",
     "DominantDirection",
-    "ExplicitCycle",
     "Extrema",
     "ExtremumTest",
+    "FastExplicitDiffusion",
+    "KeypointLayer",
+    "LayerSamples",
+    "NonlinearScaleSpace",
     "Octave",
-    "Samples",
+    "OperatorSplitting",
     "ScaleSpace",
-    "Scheme",
-    "Seat",
-    "Splitting",
     "Stack",
     "box_hessian",
+    "concatenate_layers",
     "difference_of_gaussians",
-    "disc",
+    "disc_offsets",
     "dominant_direction",
     "double",
     "extrema",
+    "filter_scale",
     "filter_sizes",
     "find_extrema",
     "gaussian",
+    "interpolate_layer",
     "laplacian",
+    "max_octaves",
+    "nearest_layer",
     "nonlinear",
+    "nonlinear_scale_space",
+    "normalize_rows",
     "octaves",
-    "octaves_that_fit",
     "orientation",
-    "read",
-    "samples_of",
-    "scale_of",
-    "seat_of",
-    "stacks",
-    "turned",
-    "unit_rows",
+    "oriented_grid",
+    "rotate_gradients",
+    "sampling",
 ]

@@ -16,7 +16,7 @@ LAYERS = 4
 
 
 class BoxHessian(eqx.Module):
-    """Responses of an octave.
+    """Box-filter Hessian responses of an octave.
 
     Attributes:
         determinant: of the Hessian, squared gray levels; one layer a size of the filter.
@@ -45,12 +45,12 @@ def filter_sizes(octave: int) -> tuple[int, ...]:
     return tuple(3 * (2 ** (octave + 1) * (layer + 1) + 1) for layer in range(LAYERS))
 
 
-def scale_of(size: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Blur of the Gaussian that a filter of this side stands for, px.
+def filter_scale(size: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Standard deviation of the Gaussian that a box filter of this side approximates, px.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> round(float(scale_of(jnp.array([9.0]))[0]), 6)
+        >>> round(float(filter_scale(jnp.array([9.0]))[0]), 6)
         1.2
     """
     return size * (_SIGMA / _SMALLEST)
@@ -99,7 +99,7 @@ def box_hessian(image: Float[Array, "h w"], *, octave: int = 0, weight: float = 
 def _derivatives(
     sums: Array, lobes: Int[Array, " s"], *, margin: int, step: int, rows: int, columns: int
 ) -> tuple[Array, Array, Array]:
-    """Sums of D_uu, D_vv and D_uv of every lobe's width."""
+    """Sums of D_uu, D_vv and D_uv for every width of a lobe."""
     size = ((rows - 1) * step + 1, (columns - 1) * step + 1)
 
     def of(lobe: Int[Array, ""]) -> tuple[Array, Array, Array]:
@@ -122,11 +122,11 @@ def _derivatives(
     return lax.map(of, lobes)
 
 
-def octaves_that_fit(shape: tuple[int, int], most: int) -> int:
-    """Octaves whose largest filter lies within the image somewhere, at least one.
+def max_octaves(shape: tuple[int, int], most: int) -> int:
+    """Number of octaves whose largest filter fits into the image, at least one.
 
     Example:
-        >>> octaves_that_fit((128, 200), 4), octaves_that_fit((640, 480), 4)
+        >>> max_octaves((128, 200), 4), max_octaves((640, 480), 4)
         (3, 4)
     """
     room = (min(shape) - 1) / 3.0

@@ -1,4 +1,4 @@
-"""Points that stand out in position and scale: extrema of a stack of responses, found between its samples."""
+"""Extrema of a stack of filter responses over position and scale, with subpixel refinement."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,10 +9,10 @@ _MOVES = 5
 
 
 class Extrema(eqx.Module):
-    """Extrema of a stack.
+    """Extrema of a stack of responses.
 
     Attributes:
-        place: (layer, row, column), fractions of samples; derivatives are those of the interpolated extremum.
+        place: interpolated position (layer, row, column), differentiable.
         value: response there.
         valid: which slots hold one.
     """
@@ -23,34 +23,35 @@ class Extrema(eqx.Module):
 
 
 class ExtremumTest(eqx.Module):
-    """What counts as an extremum.
+    """Criteria of an extremum.
 
     Attributes:
         least_value: least absolute response between samples; half of it at a sample.
         edge_ratio: greatest ratio of principal curvatures in the image.
         border: width of the margin without extrema, samples.
         minima: whether minima count as well as maxima.
-        flat: each layer by itself, the first and last too: extrema among 8 neighbors, which stay in their layer.
+        within_layer: extrema among the 8 neighbors of the same layer, without refinement over scale; first and last
+            layer included.
     """
 
     least_value: float | Float[Array, ""]
     edge_ratio: float | Float[Array, ""] = 10.0
     border: int = eqx.field(static=True, default=5)
     minima: bool = eqx.field(static=True, default=True)
-    flat: bool = eqx.field(static=True, default=False)
+    within_layer: bool = eqx.field(static=True, default=False)
 
 
 @eqx.filter_jit
 def find_extrema(stack: Float[Array, "s h w"], test: ExtremumTest, *, capacity: int) -> Extrema:
-    """Extrema against all 26 neighbors, moved to the vertex of a paraboloid, without faint ones and edges.
+    """Extrema among 26 neighbors, refined by a quadratic model, without low contrast and edges.
 
     Args:
         stack: responses over layer, row and column.
-        test: what counts.
+        test: criteria.
         capacity: slots; the strongest samples are kept.
 
     Returns:
-        The extrema. Their number is bounded by the stack's inner samples.
+        The extrema, strongest sample first.
 
     References:
         Thesis section 2.2.2: 26 neighbors [T-29], second-order Taylor expansion (eq. 2.33) [T-30], contrast [T-31],
@@ -67,7 +68,7 @@ def find_extrema(stack: Float[Array, "s h w"], test: ExtremumTest, *, capacity: 
     stack = jnp.where(jnp.isfinite(stack), stack, 0.0)
     _, height, width = stack.shape
     strength = lax.stop_gradient(jnp.where(_is_extremum(stack, test), jnp.abs(stack), 0.0))
-    first = 0 if test.flat else 1
+    first = 0 if test.within_layer else 1
     inner = strength[first : stack.shape[0] - first].reshape(-1)
     count = min(capacity, inner.shape[0])
     strongest, index = lax.top_k(inner, count)
@@ -79,7 +80,7 @@ def find_extrema(stack: Float[Array, "s h w"], test: ExtremumTest, *, capacity: 
 
 
 def _is_extremum(stack: Float[Array, "s h w"], test: ExtremumTest) -> Bool[Array, "s h w"]:
-    axes = (1, 2) if test.flat else (0, 1, 2)
+    axes = (1, 2) if test.within_layer else (0, 1, 2)
     greatest = _neighborhood(stack, jnp.maximum, -jnp.inf, axes)
     extreme = (stack >= greatest) & (stack > 0.5 * test.least_value)
     if test.minima:
@@ -92,45 +93,45 @@ def _is_extremum(stack: Float[Array, "s h w"], test: ExtremumTest) -> Bool[Array
     return extreme & rows[None, :, None] & columns[None, None, :]
 
 
-def _neighborhood(stack: Array, better: object, outside: float, axes: tuple[int, ...]) -> Array:
-    """The best of each sample's neighborhood of three samples along axes, one after the other."""
+def _neighborhood(stack: Array, extremum: object, outside: float, axes: tuple[int, ...]) -> Array:
+    """Maximum or minimum over three samples along each of the axes."""
     for axis in axes:
         edges = [(1, 1) if axis == k else (0, 0) for k in range(3)]
         padded, size = jnp.pad(stack, edges, constant_values=outside), stack.shape[axis]
         before, after = (lax.slice_in_dim(padded, start, start + size, axis=axis) for start in (0, 2))
-        stack = better(stack, better(before, after))  # pyright: ignore[reportCallIssue]
+        stack = extremum(stack, extremum(before, after))  # pyright: ignore[reportCallIssue]
     return stack
 
 
 def _interpolate(stack: Array, start: Int[Array, "n 3"], valid: Bool[Array, " n"], test: ExtremumTest) -> Extrema:
-    """Moves each extremum by whole samples until its vertex lies within half a sample of it."""
+    """Moves each extremum by whole samples until the vertex of its quadratic model is within half a sample."""
     limits = jnp.asarray(stack.shape, jnp.int32)
-    margin = jnp.asarray([0 if test.flat else 1, max(test.border, 1), max(test.border, 1)], jnp.int32)
+    margin = jnp.asarray([0 if test.within_layer else 1, max(test.border, 1), max(test.border, 1)], jnp.int32)
     frozen = lax.stop_gradient(stack)
 
-    def move(_: object, carried: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        place, alive, settled = carried
-        offset = _vertex(_cubes(frozen, place), test.flat)[0]
+    def move(_: object, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        place, inside, settled = state
+        offset = _vertex(_cubes(frozen, place), test.within_layer)[0]
         settled = settled | jnp.all(jnp.abs(offset) < 0.5, axis=1)
         step = jnp.clip(jnp.round(offset), -2.0, 2.0).astype(jnp.int32)
         moved = jnp.where(settled[:, None], place, place + step)
-        inside = jnp.all((moved >= margin[None, :]) & (moved < (limits - margin)[None, :]), axis=1)
-        return jnp.where(inside[:, None], moved, place), alive & inside, settled
+        fits = jnp.all((moved >= margin[None, :]) & (moved < (limits - margin)[None, :]), axis=1)
+        return jnp.where(fits[:, None], moved, place), inside & fits, settled
 
-    place, alive, settled = lax.fori_loop(0, _MOVES, move, (start, valid, jnp.zeros_like(valid)))
+    place, inside, settled = lax.fori_loop(0, _MOVES, move, (start, valid, jnp.zeros_like(valid)))
     cubes = _cubes(stack, place)
-    offset, slope, (bend_u, bend_v, twist) = _vertex(cubes, test.flat)
+    offset, slope, (uu, vv, uv) = _vertex(cubes, test.within_layer)
     value = cubes[1][1][1] + 0.5 * jnp.sum(slope * offset, axis=1)
-    trace, determinant = bend_u + bend_v, bend_u * bend_v - twist * twist
+    trace, determinant = uu + vv, uu * vv - uv * uv
     ratio = test.edge_ratio
-    round_enough = (determinant > 0) & (trace * trace * ratio < (ratio + 1.0) ** 2 * determinant)
-    good = alive & settled & round_enough & (jnp.abs(value) >= test.least_value)
+    isotropic = (determinant > 0) & (trace * trace * ratio < (ratio + 1.0) ** 2 * determinant)
+    good = inside & settled & isotropic & (jnp.abs(value) >= test.least_value)
     place = jnp.where(good[:, None], place.astype(stack.dtype) + offset, 0.0)
     return Extrema(place, jnp.where(good, value, 0.0), good)
 
 
 def _cubes(stack: Float[Array, "s h w"], place: Int[Array, "n 3"]) -> list[list[list[Array]]]:
-    """The 3x3x3 samples about each place, as arrays over places."""
+    """The 3x3x3 neighborhoods of all places, as arrays over places."""
     _, height, width = stack.shape
     shifts = jnp.arange(-1, 2, dtype=place.dtype)
     around = (shifts[:, None, None] * height + shifts[None, :, None]) * width + shifts[None, None, :]
@@ -140,8 +141,8 @@ def _cubes(stack: Float[Array, "s h w"], place: Int[Array, "n 3"]) -> list[list[
     return [[[samples[9 * a + 3 * b + c] for c in range(3)] for b in range(3)] for a in range(3)]
 
 
-def _vertex(cubes: list[list[list[Array]]], flat: bool) -> tuple[Array, Array, tuple[Array, Array, Array]]:
-    """Offset of the paraboloid's vertex, the slope at the middle, and the second derivatives in the image."""
+def _vertex(cubes: list[list[list[Array]]], within_layer: bool) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """Offset of the quadratic model's vertex, gradient at the center, and second derivatives in the image."""
     middle = cubes[1][1][1]
     slope_s = 0.5 * (cubes[2][1][1] - cubes[0][1][1])
     slope_v = 0.5 * (cubes[1][2][1] - cubes[1][0][1])
@@ -152,9 +153,9 @@ def _vertex(cubes: list[list[list[Array]]], flat: bool) -> tuple[Array, Array, t
     uv = 0.25 * (cubes[1][2][2] - cubes[1][2][0] - cubes[1][0][2] + cubes[1][0][0])
     us = 0.25 * (cubes[2][1][2] - cubes[2][1][0] - cubes[0][1][2] + cubes[0][1][0])
     vs = 0.25 * (cubes[2][2][1] - cubes[2][0][1] - cubes[0][2][1] + cubes[0][0][1])
-    if flat:
-        still = jnp.zeros_like(middle)
-        slope_s, ss, us, vs = still, still - 1.0, still, still
+    if within_layer:
+        zero = jnp.zeros_like(middle)
+        slope_s, ss, us, vs = zero, zero - 1.0, zero, zero
     # Cramer's rule for the symmetric matrix [[ss, vs, us], [vs, vv, uv], [us, uv, uu]].
     a, b, c = vv * uu - uv * uv, us * uv - vs * uu, vs * uv - us * vv
     determinant = ss * a + vs * b + us * c

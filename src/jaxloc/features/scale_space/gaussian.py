@@ -1,4 +1,4 @@
-"""The Gaussian scale space: an image at every blur, and what stands out at each."""
+"""Gaussian scale space: octaves of blurred images, their differences, and the Laplacian of Gaussian."""
 
 import math
 
@@ -11,7 +11,7 @@ from jaxloc.images.gradients import smooth
 
 
 class Octave(eqx.Module):
-    """Layers of one sampling of an image.
+    """Layers of one resolution.
 
     Attributes:
         layers: the image at growing blur, one a layer, gray levels.
@@ -25,13 +25,13 @@ class Octave(eqx.Module):
 
 
 class ScaleSpace(eqx.Module):
-    """How a scale space is sampled.
+    """Sampling of a Gaussian scale space.
 
     Attributes:
-        octave_layers: layers in which a scale doubles (three more are computed for the extrema).
+        octave_layers: layers an octave (three more are computed for the extrema).
         sigma: blur of the first layer, px of its octave.
         camera_sigma: blur that the image has already, px.
-        doubled: begin with the image at twice its size: four times as many points, and four times the time.
+        doubled: the first octave is the image at twice its size: four times as many points and time.
         least_side: shorter side of the last octave, px.
 
     References:
@@ -58,8 +58,8 @@ class ScaleSpace(eqx.Module):
 def laplacian(image: Float[Array, "h w"], sigma: float) -> Float[Array, "h w"]:
     """Scale-normalized Laplacian of Gaussian, ``sigma^2 (d_uu + d_vv) G_sigma * I``.
 
-    Its response to a blob does not depend on the blob's size when sigma follows it. Derivatives are exact ones of a
-    sampled Gaussian, in separable passes.
+    The response to a blob does not depend on its size when sigma is proportional to it. The kernels are exact
+    derivatives of a sampled Gaussian, in separable passes.
 
     Args:
         image: gray levels.
@@ -76,17 +76,17 @@ def laplacian(image: Float[Array, "h w"], sigma: float) -> Float[Array, "h w"]:
         >>> import jax.numpy as jnp
         >>> u, v = jnp.meshgrid(jnp.arange(41.0) - 20, jnp.arange(41.0) - 20)
         >>> blob = 100.0 * jnp.exp(-(u**2 + v**2) / (2 * 4.0**2))
-        >>> round(float(laplacian(blob, 4.0)[20, 20]))  # half of the height, where sigma is the blob's
+        >>> round(float(laplacian(blob, 4.0)[20, 20]))  # half of the height, for sigma of the blob
         -50
     """
     radius = max(1, min(math.ceil(4.0 * sigma), min(image.shape) - 1))
     offsets = jnp.arange(-radius, radius + 1, dtype=image.dtype)
     gauss = jnp.exp(-0.5 * (offsets / sigma) ** 2)
     gauss = gauss / jnp.sum(gauss)
-    bend = gauss * ((offsets / sigma) ** 2 - 1.0)
-    # What cutting the kernel leaves is taken off: a constant has no Laplacian, a parabola its own.
-    bend = bend - jnp.mean(bend)
-    bend = bend * 2.0 * sigma**2 / jnp.sum(bend * offsets**2)
+    second = gauss * ((offsets / sigma) ** 2 - 1.0)
+    # Correction of truncation: exact for constants and parabolas.
+    second = second - jnp.mean(second)
+    second = second * 2.0 * sigma**2 / jnp.sum(second * offsets**2)
     padded = jnp.pad(image, radius, mode="reflect")
 
     def convolve(weights: Array, across: Array) -> Array:
@@ -94,14 +94,14 @@ def laplacian(image: Float[Array, "h w"], sigma: float) -> Float[Array, "h w"]:
         rows = sum(weights[i] * padded[i : i + height] for i in range(2 * radius + 1))
         return sum(across[j] * rows[:, j : j + width] for j in range(2 * radius + 1))
 
-    return convolve(bend, gauss) + convolve(gauss, bend)
+    return convolve(second, gauss) + convolve(gauss, second)
 
 
 @eqx.filter_jit
 def difference_of_gaussians(image: Float[Array, "h w"], sigma: float, ratio: float) -> Float[Array, "h w"]:
     """``(G_(k sigma) - G_sigma) * I``, which is ``(k - 1)`` times the scale-normalized Laplacian, to first order.
 
-    The heat equation ``dG / dsigma = sigma laplace G`` says why.
+    By the heat equation ``dG / dsigma = sigma laplace G``.
 
     Args:
         image: gray levels.
@@ -116,20 +116,20 @@ def difference_of_gaussians(image: Float[Array, "h w"], sigma: float, ratio: flo
         >>> bool(jnp.all(jnp.abs(difference_of_gaussians(jnp.ones((16, 16)), 1.0, 1.2)) < 1e-6))
         True
     """
-    narrow, wide = (smooth(image, s, radius=_reach(s, image.shape)) for s in (sigma, ratio * sigma))
+    narrow, wide = (smooth(image, s, radius=_kernel_radius(s, image.shape)) for s in (sigma, ratio * sigma))
     return wide - narrow
 
 
-def _reach(sigma: float, shape: tuple[int, ...]) -> int:
+def _kernel_radius(sigma: float, shape: tuple[int, ...]) -> int:
     return max(1, min(math.ceil(4.0 * sigma), min(shape) - 1))
 
 
 def double(image: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
-    """The image at twice its size, linearly between pixels: pixel (u, v) lands on (2 u, 2 v)."""
+    """The image at twice its size by linear interpolation; pixel (u, v) becomes (2 u, 2 v)."""
 
     def along(values: Float[Array, "n m"]) -> Float[Array, "n2 m"]:
-        later = jnp.concatenate([values[1:], values[-1:]])
-        return jnp.stack([values, 0.5 * (values + later)], axis=1).reshape(2 * values.shape[0], values.shape[1])
+        following = jnp.concatenate([values[1:], values[-1:]])
+        return jnp.stack([values, 0.5 * (values + following)], axis=1).reshape(2 * values.shape[0], values.shape[1])
 
     return along(along(image).T).T
 
@@ -153,24 +153,24 @@ def octaves(image: Float[Array, "h w"], options: ScaleSpace) -> tuple[Octave, ..
     step, have = (0.5, 2.0 * options.camera_sigma) if options.doubled else (1.0, options.camera_sigma)
     base = double(image) if options.doubled else image
     missing = math.sqrt(max(options.sigma**2 - have**2, 1e-4))
-    base = smooth(base, missing, radius=_reach(missing, base.shape))
+    base = smooth(base, missing, radius=_kernel_radius(missing, base.shape))
     blurs, found = options.blurs(), []
     while not found or min(base.shape) >= options.least_side:
-        stack = _blurred(base, blurs)
+        stack = _blur_layers(base, blurs)
         found.append(Octave(stack, stack[1:] - stack[:-1], step))
-        # The layer with twice the blur, every second pixel of it, begins the next octave.
+        # The next octave begins with every second pixel of the layer with twice the blur.
         base, step = stack[options.octave_layers][::2, ::2], 2.0 * step
     return tuple(found)
 
 
-def _blurred(base: Float[Array, "h w"], blurs: tuple[float, ...]) -> Float[Array, "s h w"]:
+def _blur_layers(base: Float[Array, "h w"], blurs: tuple[float, ...]) -> Float[Array, "s h w"]:
     """The layers of an octave, each blurred from the one before: one loop, which compiles faster than five kernels."""
     more = [math.sqrt(after**2 - before**2) for before, after in zip(blurs[:-1], blurs[1:], strict=True)]
-    radius = _reach(max(more), base.shape)
+    radius = _kernel_radius(max(more), base.shape)
 
-    def widen(layer: Array, sigma: Array) -> tuple[Array, Array]:
+    def blur(layer: Array, sigma: Array) -> tuple[Array, Array]:
         wider = smooth(layer, sigma, radius=radius)
         return wider, wider
 
-    _, layers = lax.scan(widen, base, jnp.asarray(more, base.dtype))
+    _, layers = lax.scan(blur, base, jnp.asarray(more, base.dtype))
     return jnp.concatenate([base[None], layers])

@@ -1,8 +1,7 @@
-"""The nonlinear scale space: an image at every time of a diffusion that stops at edges, and its determinant."""
+"""Nonlinear scale space of KAZE and A-KAZE: layers of edge-stopping diffusion and their Hessian determinants."""
 
 import math
 from abc import abstractmethod
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,61 +21,61 @@ from jaxloc.images.diffusion import (
 from jaxloc.images.gradients import smooth
 from jaxloc.images.pyramid import halve
 
-# Shorter side of the smallest octave, px; what the contrast loses with each octave that is sampled by halves.
+# Shorter side of the smallest octave, px; factor of the contrast parameter from one halved octave to the next.
 _LEAST_SIDE, _CONTRAST_LOSS = 40, 0.75
-# Blur before derivatives, px of the stack.
+# Gaussian blur before derivatives, px of the stack.
 _SMOOTHING = 1.0
 
 
-class Scheme(eqx.Module):
-    """How diffusion is integrated from one layer to the next."""
+class DiffusionScheme(eqx.Module):
+    """Integration of the diffusion equation from one layer to the next."""
 
     @abstractmethod
     def steps(self, times: tuple[float, ...]) -> np.ndarray:
-        """Steps "layers n" that last these times; zeros fill up."""
+        """Time steps "layers n" whose sums are these times, padded with zeros."""
 
     @abstractmethod
     def advance(self, image: Float[Array, "h w"], conductance: Float[Array, "h w"], steps: Array) -> Array:
         """The image after the steps."""
 
 
-class Splitting(Scheme):
+class OperatorSplitting(DiffusionScheme):
     """Additive operator splitting: one implicit step a layer, as in KAZE [T-48]."""
 
     def steps(self, times: tuple[float, ...]) -> np.ndarray:
-        """The times themselves."""
+        """One step a layer: the times themselves."""
         return np.array(times)[:, None]
 
     def advance(self, image: Float[Array, "h w"], conductance: Float[Array, "h w"], steps: Array) -> Array:
-        """One step."""
+        """One implicit step."""
         return diffuse_implicit(image, conductance, steps[0])
 
 
-class ExplicitCycle(Scheme):
+class FastExplicitDiffusion(DiffusionScheme):
     """Fast explicit diffusion: one cycle a layer, as in A-KAZE [T-49]."""
 
     def steps(self, times: tuple[float, ...]) -> np.ndarray:
-        """Cycles of `fed_steps`; steps of no time fill up short ones."""
+        """Cycles of `fed_steps`; short ones are padded with zeros."""
         cycles = [fed_steps(time) for time in times]
         return np.array([cycle + (0.0,) * (max(map(len, cycles)) - len(cycle)) for cycle in cycles])
 
     def advance(self, image: Float[Array, "h w"], conductance: Float[Array, "h w"], steps: Array) -> Array:
-        """One cycle."""
+        """One cycle of explicit steps."""
         return diffuse_explicit(image, conductance, steps)
 
 
-class DiffusedScaleSpace(eqx.Module):
-    """How a nonlinear scale space is sampled.
+class NonlinearScaleSpace(eqx.Module):
+    """Sampling of a nonlinear scale space.
 
     Attributes:
-        octaves: most octaves, each twice the blur of the last; as many as the image has room for.
-        layers: layers in which a scale doubles.
+        octaves: greatest number of octaves, each twice the blur of the last; fewer in small images.
+        layers: layers an octave.
         sigma: blur of the first layer, px.
-        halved: sample each octave by half of the last (A-KAZE); else all at full size (KAZE).
-        scheme: of integration.
-        conductivity: where the diffusion stops.
-        percentile: of the image's gradients, which divides edges from noise.
-        reach: of derivatives, blurs; half of a keypoint's size.
+        halved: each octave has half the resolution of the last (A-KAZE); else all are at full size (KAZE).
+        scheme: numerical integration.
+        conductivity: conductivity function, which stops the diffusion at edges.
+        percentile: of the gradient magnitudes, which is the contrast parameter between noise and edges.
+        reach: half-width of the derivative kernels, in blurs; half of a keypoint's size.
 
     References:
         Alcantarilla, Bartoli, Davison, "KAZE features", ECCV 2012, section 2; Alcantarilla, Nuevo, Bartoli, "Fast
@@ -87,41 +86,41 @@ class DiffusedScaleSpace(eqx.Module):
     layers: int = eqx.field(static=True, default=4)
     sigma: float = eqx.field(static=True, default=1.6)
     halved: bool = eqx.field(static=True, default=False)
-    scheme: Scheme = Splitting()
+    scheme: DiffusionScheme = OperatorSplitting()
     conductivity: Conductivity = PeronaMalik()
     percentile: float = eqx.field(static=True, default=70.0)
     reach: float = eqx.field(static=True, default=1.0)
 
     @classmethod
-    def accelerated(cls, octaves: int = 4) -> "DiffusedScaleSpace":
-        """That of A-KAZE.
+    def akaze(cls, octaves: int = 4) -> "NonlinearScaleSpace":
+        """The scale space of A-KAZE.
 
         Args:
-            octaves: most octaves.
+            octaves: greatest number of octaves.
 
         Example:
-            >>> DiffusedScaleSpace.accelerated().reach
+            >>> NonlinearScaleSpace.akaze().reach
             1.5
         """
-        return cls(octaves, halved=True, scheme=ExplicitCycle(), reach=1.5)
+        return cls(octaves, halved=True, scheme=FastExplicitDiffusion(), reach=1.5)
 
-    def stacks(self, shape: tuple[int, ...]) -> tuple[int, int]:
-        """How many stacks of layers there are, and in how many layers of one the extrema lie."""
+    def layout(self, shape: tuple[int, ...]) -> tuple[int, int]:
+        """Number of stacks of layers, and number of inner layers of a stack, in which extrema are sought."""
         room = max(1, 1 + math.floor(math.log2(max(min(shape) / _LEAST_SIDE, 1.0))))
         octaves = min(self.octaves, room)
         return (octaves, self.layers) if self.halved else (1, octaves * self.layers)
 
     def blurs(self, count: int) -> tuple[float, ...]:
-        """Blur of each layer of a stack with extrema in `count` layers, px of the stack."""
+        """Blur of each layer of a stack with `count` inner layers, px of the stack."""
         return tuple(self.sigma * 2.0 ** (k / self.layers) for k in range(count + 2))
 
 
 class Stack(eqx.Module):
-    """Layers of one sampling of an image.
+    """Layers of one resolution.
 
     Attributes:
         layers: the diffused image, gray levels.
-        right: derivative along rows over the layer's reach, gray levels a pixel of the stack.
+        right: derivative along rows, by a kernel as wide as the layer's reach, gray levels a pixel of the stack.
         down: along columns.
         determinant: of the Hessian times the fourth power of the reach, squared gray levels.
         step: distance of two pixels of the stack, px of the image.
@@ -135,7 +134,7 @@ class Stack(eqx.Module):
 
 
 @eqx.filter_jit
-def stacks(image: Float[Array, "h w"], options: DiffusedScaleSpace) -> tuple[Stack, ...]:
+def nonlinear_scale_space(image: Float[Array, "h w"], options: NonlinearScaleSpace) -> tuple[Stack, ...]:
     """The nonlinear scale space of an image, finest stack first.
 
     Args:
@@ -143,27 +142,29 @@ def stacks(image: Float[Array, "h w"], options: DiffusedScaleSpace) -> tuple[Sta
         options: sampling, scheme and conductivity.
 
     Returns:
-        Stacks; extrema of the determinant lie in their inner layers.
+        Stacks of layers; extrema of the determinant are sought in their inner layers.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> options = DiffusedScaleSpace.accelerated()
-        >>> [(s.layers.shape, s.step) for s in stacks(jnp.ones((90, 80)), options)]
+        >>> options = NonlinearScaleSpace.akaze()
+        >>> [(s.layers.shape, s.step) for s in nonlinear_scale_space(jnp.ones((90, 80)), options)]
         [((6, 90, 80), 1.0), ((6, 45, 40), 2.0)]
     """
     image = jnp.where(jnp.isfinite(image), image, 0.0)
-    number, count = options.stacks(image.shape)
+    number, count = options.layout(image.shape)
     edge = contrast(image, percentile=options.percentile)
     blurs, base, found = options.blurs(count), smooth(image, options.sigma), []
     for k in range(number):
-        layers = _diffused(base, edge, blurs, options)
+        layers = _diffuse_layers(base, edge, blurs, options)
         found.append(Stack(layers, *_derivatives(layers, [options.reach * blur for blur in blurs]), step=2.0**k))
         if k + 1 < number:
             base, edge = halve(layers[options.layers]), _CONTRAST_LOSS * edge
     return tuple(found)
 
 
-def _diffused(base: Array, edge: Array, blurs: tuple[float, ...], options: DiffusedScaleSpace) -> Float[Array, "s h w"]:
+def _diffuse_layers(
+    base: Array, edge: Array, blurs: tuple[float, ...], options: NonlinearScaleSpace
+) -> Float[Array, "s h w"]:
     """The layers of a stack, each diffused from the one before for half the growth of the squared blur."""
     times = tuple(0.5 * (after**2 - before**2) for before, after in zip(blurs[:-1], blurs[1:], strict=True))
 
@@ -177,13 +178,13 @@ def _diffused(base: Array, edge: Array, blurs: tuple[float, ...], options: Diffu
 
 
 def _derivatives(layers: Float[Array, "s h w"], wanted: list[float]) -> tuple[Array, Array, Array]:
-    """First derivatives of all layers and their determinants, by Scharr's kernel spread over the layer's reach."""
+    """First derivatives of all layers and their determinants, by Scharr's kernel dilated to the layer's reach."""
     _, height, width = layers.shape
     reaches = [max(1, round(reach)) for reach in wanted]
     margin = min(max(reaches), (min(height, width) - 1) // 2)
     reaches = [min(reach, margin) for reach in reaches]
 
-    def of(item: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def differentiate(item: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         layer, reach, scale = item
         wide = jnp.pad(smooth(layer, _SMOOTHING), 2 * margin, mode="reflect")
         right, down = _scharr(wide, reach, margin, (height + 2 * margin, width + 2 * margin))
@@ -193,9 +194,9 @@ def _derivatives(layers: Float[Array, "s h w"], wanted: list[float]) -> tuple[Ar
         return right[inner], down[inner], (uu * vv - uv * uv) * scale
 
     # One program for all layers: it compiles faster than one a reach.
-    # Responses of neighboring layers are alike when the reach before rounding makes them free of scale.
+    # Normalizing by the reach before rounding keeps the responses of neighboring layers comparable.
     scales = jnp.asarray([reach**4 for reach in wanted], layers.dtype)
-    return lax.map(of, (layers, jnp.asarray(reaches, jnp.int32), scales))
+    return lax.map(differentiate, (layers, jnp.asarray(reaches, jnp.int32), scales))
 
 
 def _scharr(image: Array, reach: Int[Array, ""], margin: int, shape: tuple[int, int]) -> tuple[Array, Array]:
@@ -210,76 +211,3 @@ def _scharr(image: Array, reach: Int[Array, ""], margin: int, shape: tuple[int, 
     right = weight * (3.0 * (diagonal + other) + 10.0 * (corner[0, 1] - corner[0, -1]))
     down = weight * (3.0 * (diagonal - other) + 10.0 * (corner[1, 0] - corner[-1, 0]))
     return right, down
-
-
-class Samples(NamedTuple):
-    """All layers of all stacks, one after the other, and where each lies.
-
-    Attributes:
-        values: gray level and both derivatives.
-        start: first entry of each (stack, layer).
-        shape: (rows, columns) of each stack.
-    """
-
-    values: Float[Array, "m 3"]
-    start: Int[Array, "o s"]
-    shape: Int[Array, "o 2"]
-
-
-def samples_of(found: tuple[Stack, ...]) -> Samples:
-    """Lays the stacks out for reading."""
-    parts, starts, start = [], [], 0
-    for stack in found:
-        count, height, width = stack.layers.shape
-        channels = stack.layers, stack.right, stack.down
-        parts.append(jnp.stack([channel.reshape(-1) for channel in channels], axis=1))
-        starts.append([start + k * height * width for k in range(count)])
-        start += stack.layers.size
-    shapes = [stack.layers.shape[1:] for stack in found]
-    return Samples(jnp.concatenate(parts), jnp.asarray(starts, jnp.int32), jnp.asarray(shapes, jnp.int32))
-
-
-class Seat(NamedTuple):
-    """The layer that belongs to a keypoint, and the keypoint there, in pixels of the stack.
-
-    Attributes:
-        start: first entry of the layer.
-        shape: (rows, columns).
-        uv: "n 2".
-        reach: distance of two samples.
-    """
-
-    start: Int[Array, " n"]
-    shape: Int[Array, "n 2"]
-    uv: Float[Array, "n 2"]
-    reach: Float[Array, " n"]
-
-
-def seat_of(samples: Samples, uv: Array, sigma: Float[Array, " n"], options: DiffusedScaleSpace) -> Seat:
-    """The layer whose blur is nearest to sigma (px of the image)."""
-    number, several = samples.start.shape
-    level = options.layers * jnp.log2(jnp.maximum(lax.stop_gradient(sigma), 1e-3) / options.sigma)
-    stack = jnp.clip(jnp.floor((level - 0.5) / options.layers), 0, number - 1).astype(jnp.int32)
-    layer = jnp.round(level - (options.layers * stack).astype(level.dtype))
-    layer = jnp.clip(layer, 0, several - 1).astype(jnp.int32)
-    step = jnp.exp2(stack.astype(sigma.dtype))
-    return Seat(samples.start[stack, layer], samples.shape[stack], uv / step[:, None], options.reach * sigma / step)
-
-
-def read(samples: Samples, seat: Seat, u: Float[Array, "n k"], v: Float[Array, "n k"]) -> tuple[Array, Array]:
-    """Values "n k 3" between pixels of each keypoint's layer (at the border outside), and which lie inside "n k"."""
-    height, width = seat.shape[:, :1], seat.shape[:, 1:]
-    bounded_u = jnp.clip(u, 0.0, (width - 1).astype(u.dtype))
-    bounded_v = jnp.clip(v, 0.0, (height - 1).astype(v.dtype))
-    column = jnp.clip(jnp.floor(lax.stop_gradient(bounded_u)).astype(jnp.int32), 0, width - 2)
-    row = jnp.clip(jnp.floor(lax.stop_gradient(bounded_v)).astype(jnp.int32), 0, height - 2)
-    part_u, part_v = bounded_u - column.astype(u.dtype), bounded_v - row.astype(v.dtype)
-    flat = seat.start[:, None] + row * width + column
-    corners = (
-        (flat, (1.0 - part_u) * (1.0 - part_v)),
-        (flat + 1, part_u * (1.0 - part_v)),
-        (flat + width, (1.0 - part_u) * part_v),
-        (flat + width + 1, part_u * part_v),
-    )
-    values = sum(samples.values[index] * share[:, :, None] for index, share in corners)
-    return values, (bounded_u == u) & (bounded_v == v)

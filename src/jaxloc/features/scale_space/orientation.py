@@ -1,4 +1,4 @@
-"""The direction of a neighborhood: where most of its slopes point, within a window that slides around the circle."""
+"""Dominant gradient direction of a neighborhood, by a sliding window of angles."""
 
 import math
 
@@ -9,15 +9,15 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc._linalg import matmul
 
-_TOGETHER = 64
+_BATCH = 64
 
 
 class DominantDirection(eqx.Module):
-    """Directions of neighborhoods.
+    """Dominant directions of neighborhoods.
 
     Attributes:
         angle: from the right axis towards down, rad in [0, 2 pi); zero where there is none.
-        ok: False where all slopes are zero.
+        ok: False where all gradients are zero.
     """
 
     angle: Float[Array, " n"]
@@ -28,12 +28,12 @@ class DominantDirection(eqx.Module):
 def dominant_direction(
     right: Float[Array, "n k"], down: Float[Array, "n k"], *, width: float = math.pi / 3.0
 ) -> DominantDirection:
-    """Direction of the longest sum of slopes within a window of directions.
+    """Direction of the longest sum of gradients within a window of angles.
 
-    Every slope begins a window in turn: no other window holds more, and nothing depends on where angles begin.
+    The window is placed at the angle of every gradient in turn, so that the result is invariant to rotation.
 
     Args:
-        right: weighted slopes along rows of each neighborhood.
+        right: weighted derivatives along rows of each neighborhood.
         down: along columns.
         width: of the window, rad; static.
 
@@ -47,8 +47,8 @@ def dominant_direction(
         45.0
     """
 
-    def one(slopes: tuple[Array, Array]) -> tuple[Array, Array]:
-        right, down = slopes
+    def one(gradients: tuple[Array, Array]) -> tuple[Array, Array]:
+        right, down = gradients
         frozen_right, frozen_down = lax.stop_gradient(right), lax.stop_gradient(down)
         angle = jnp.arctan2(frozen_down, frozen_right)
         ahead = (angle[None, :] - angle[:, None]) % (2.0 * math.pi)
@@ -57,17 +57,17 @@ def dominant_direction(
         members = within[jnp.argmax(jnp.sum(sums * sums, axis=1))]
         return jnp.sum(members * right), jnp.sum(members * down)
 
-    total_right, total_down = lax.map(one, (right, down), batch_size=min(_TOGETHER, max(len(right), 1)))
+    total_right, total_down = lax.map(one, (right, down), batch_size=min(_BATCH, max(len(right), 1)))
     some = total_right**2 + total_down**2 > 0
     angle = jnp.arctan2(jnp.where(some, total_down, 0.0), jnp.where(some, total_right, 1.0))
     return DominantDirection(angle % (2.0 * math.pi), some)
 
 
-def disc(radius: int) -> tuple[list[int], list[int]]:
-    """Whole samples (right, down) within a radius: 109 for six.
+def disc_offsets(radius: int) -> tuple[list[int], list[int]]:
+    """Offsets (right, down) of the whole pixels within a radius: 109 for six.
 
     Example:
-        >>> len(disc(6)[0])
+        >>> len(disc_offsets(6)[0])
         109
     """
     side = range(-radius, radius + 1)
@@ -75,12 +75,12 @@ def disc(radius: int) -> tuple[list[int], list[int]]:
     return [u for u, _ in inside], [v for _, v in inside]
 
 
-def unit_rows(values: Float[Array, "n d"]) -> Float[Array, "n d"]:
-    """Rows of length one, zero where they are zero.
+def normalize_rows(values: Float[Array, "n d"]) -> Float[Array, "n d"]:
+    """Rows normalized to length one; zero rows stay zero.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> unit_rows(jnp.array([[0.0, 4.0], [0.0, 0.0]])).tolist()
+        >>> normalize_rows(jnp.array([[0.0, 4.0], [0.0, 0.0]])).tolist()
         [[0.0, 1.0], [0.0, 0.0]]
     """
     squared = jnp.sum(values * values, axis=1, keepdims=True)
@@ -88,12 +88,12 @@ def unit_rows(values: Float[Array, "n d"]) -> Float[Array, "n d"]:
     return values / jnp.sqrt(jnp.where(some, squared, 1.0))
 
 
-def turned(right: Array, down: Array, angle: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Slopes "n k" along and across each keypoint's direction.
+def rotate_gradients(right: Array, down: Array, angle: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Derivatives "n k" along and across each keypoint's orientation.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> along, across = turned(jnp.array([[0.0]]), jnp.array([[2.0]]), jnp.array([jnp.pi / 2]))
+        >>> along, across = rotate_gradients(jnp.array([[0.0]]), jnp.array([[2.0]]), jnp.array([jnp.pi / 2]))
         >>> float(along[0, 0]), abs(round(float(across[0, 0]), 6))
         (2.0, 0.0)
     """

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from jaxloc.features.opencv.library import gray_bytes, load
+from jaxloc.features.opencv.backend import load, to_uint8
 from jaxloc.sensors.ground_camera import GroundCamera
 
 _MOST_LINES = 240
@@ -86,7 +86,7 @@ def estimate_pitch(images: Iterable[np.ndarray], ground: GroundCamera, *, most: 
 def _road_lines(image: np.ndarray, level: GroundCamera) -> Float64[np.ndarray, "n 4"]:
     """Straight edges: ends (left, up) of each in a camera without lens, roll and pitch, in focal lengths."""
     cv2 = load()
-    gray = gray_bytes(image)
+    gray = to_uint8(image)
     rows, columns = gray.shape
     edges = cv2.Canny(cv2.GaussianBlur(gray, (5, 5), 0), 40, 120)
     edges[: int(0.45 * rows)] = 0

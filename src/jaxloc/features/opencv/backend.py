@@ -1,4 +1,4 @@
-"""The door to OpenCV: imported when first needed, features found wherever this OpenCV keeps them."""
+"""Import of OpenCV on first use, its feature factories, and conversion of images to 8 bits."""
 
 from types import ModuleType
 
@@ -46,15 +46,15 @@ def create(name: str, **options):
     )
 
 
-def gray_bytes(image: Num[np.ndarray | Array, "h w"]) -> np.ndarray:
-    """The image as OpenCV's feature detectors want it: 8-bit gray, contiguous.
+def to_uint8(image: Num[np.ndarray | Array, "h w"]) -> np.ndarray:
+    """Converts a grayscale image to contiguous 8-bit values, the input of OpenCV's feature detectors.
 
     Args:
-        image: Bytes as they are; other numbers as gray levels 0-255, or 0-1 if no value exceeds 1.
+        image: uint8 is unchanged; other types are gray levels 0-255, or 0-1 if no value exceeds 1.
 
     Example:
         >>> import numpy as np
-        >>> gray_bytes(np.array([[0.0, 127.6, 300.0]])).tolist()
+        >>> to_uint8(np.array([[0.0, 127.6, 300.0]])).tolist()
         [[0, 128, 255]]
     """
     pixels = np.asarray(image)
