@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from jaxloc.features import Descriptors
-from jaxloc.odometry import CameraMotion, StereoFeatures, find_moving, group_points
+from jaxloc.odometry import StereoFeatures, find_moving, group_points
 from jaxloc.poses import SE3
 from jaxloc.refinement import StereoMatches
 from jaxloc.sensors import Pinhole, StereoRig
-from jaxloc.solvers import Estimate
+from jaxloc.solvers import Estimate, RobustEstimate
 
 DT = 0.1
 RIG = StereoRig(Pinhole(400.0, 400.0, 200.0, 100.0), 0.5)
@@ -62,7 +62,7 @@ def scene():
     # Odometry explains half of the wall.
     inlier = jnp.arange(len(before)) < 6
     matches = StereoMatches.of(previous.measured, current.measured, None, None, inlier)
-    return previous, current, matches, CameraMotion(estimate, inlier), after
+    return previous, current, matches, RobustEstimate(estimate, inlier), after
 
 
 # T-4, T-78

@@ -4,10 +4,9 @@ from jaxloc.odometry import moving_objects, scene_flow, stereo_matching, visual_
 from jaxloc.odometry.moving_objects import GroupOptions, MovingObjects, group_points
 from jaxloc.odometry.scene_flow import FlowOptions, MovingPoints, find_moving
 from jaxloc.odometry.stereo_matching import MatchingOptions, StereoFeatures, match_frames, match_stereo
-from jaxloc.odometry.visual_odometry import CameraMotion, MotionOptions, estimate_disparity_offset, estimate_motion
+from jaxloc.odometry.visual_odometry import MotionOptions, estimate_disparity_offset, estimate_motion
 
 __all__ = [
-    "CameraMotion",
     "FlowOptions",
     "GroupOptions",
     "MatchingOptions",

@@ -16,10 +16,10 @@ from jaxloc.beliefs.square_root import cholesky, whiten
 from jaxloc.images.patches import extract
 from jaxloc.multiview.stereo_triangulation import triangulate
 from jaxloc.odometry.stereo_matching import StereoFeatures
-from jaxloc.odometry.visual_odometry import CameraMotion
 from jaxloc.poses import SE3
 from jaxloc.refinement import StereoMatches
 from jaxloc.sensors import StereoRig
+from jaxloc.solvers import RobustEstimate
 
 _STILL_CORRELATION = 0.5  # of a patch with one that stands where it would
 _AS_ALIKE = 0.1  # insignificant difference of correlations
@@ -88,7 +88,7 @@ def find_moving(
     previous: StereoFeatures,
     current: StereoFeatures,
     matches: StereoMatches,
-    motion: CameraMotion,
+    motion: RobustEstimate,
     dt: Float[Array, ""],
     *,
     options: FlowOptions = FlowOptions(),

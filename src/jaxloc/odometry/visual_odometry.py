@@ -12,7 +12,17 @@ from jaxloc.multiview import p3p
 from jaxloc.poses import SE3
 from jaxloc.refinement import StereoMatches, StereoReprojection, motion_problem
 from jaxloc.sensors import StereoRig
-from jaxloc.solvers import Candidates, Estimate, GemanMcClure, Problem, Quadratic, ransac, solve, solve_graduated
+from jaxloc.solvers import (
+    Candidates,
+    Estimate,
+    GemanMcClure,
+    Problem,
+    Quadratic,
+    RobustEstimate,
+    ransac,
+    solve,
+    solve_graduated,
+)
 from jaxloc.solvers.problem import items
 
 
@@ -20,10 +30,10 @@ class MotionOptions(eqx.Module):
     """Options of robust motion estimation.
 
     Attributes:
-        hypotheses: P3P samples drawn beside the prediction.
+        hypotheses: P3P samples drawn beside the initial value.
         threshold: of an outlier, in sigmas of the three-component residual.
         kernel: scale of the Geman-McClure kernel, in sigmas.
-        min_inliers: a motion that fewer matches agree with is not trusted.
+        min_inliers: a motion with fewer inliers is not ok.
     """
 
     hypotheses: int = eqx.field(static=True, default=64)
@@ -32,41 +42,29 @@ class MotionOptions(eqx.Module):
     min_inliers: int = eqx.field(static=True, default=15)
 
 
-class CameraMotion(eqx.Module):
-    """Motion estimate between two frames, with its inliers.
-
-    Attributes:
-        estimate: of ``T_previous_current``.
-        inliers: matches that agree with it.
-    """
-
-    estimate: Estimate
-    inliers: Bool[Array, " n"]
-
-
 @eqx.filter_jit
 def estimate_motion(
     rig: StereoRig,
     matches: StereoMatches,
-    prediction: SE3,
+    initial: SE3,
     *,
     key: Key[Array, ""],
     options: MotionOptions = MotionOptions(),
-) -> CameraMotion:
+) -> RobustEstimate:
     """Motion of a stereo rig between two frames, from matches with outliers.
 
-    The best of the prediction and of many P3P samples starts a graduated robust refinement of the errors-in-variables
-    problem; a last plain fit of the inliers gives value and covariance.
+    The best of the initial value and of many P3P samples starts a graduated robust refinement of the
+    errors-in-variables problem; a last plain fit of the inliers gives value and covariance.
 
     Args:
         rig: the stereo rig.
         matches: measurements in both frames with covariances.
-        prediction: initial value of ``T_previous_current``, for example the last motion.
+        initial: ``T_previous_current``, for example the last motion.
         key: random key.
         options: how.
 
     Returns:
-        The motion; its estimate is not ok when too few matches agree.
+        Estimate of ``T_previous_current``, and which matches agree with it; not ok when too few do.
 
     References:
         Scaramuzza and Fraundorfer, "Visual odometry", RAM 2011; Matthies and Shafer 1987 [K-77, K-86, K-87, T-72].
@@ -78,11 +76,11 @@ def estimate_motion(
         >>> pair = jax.tree.map(lambda leaf: leaf[0], drive.pairs)
         >>> matches = jl.refinement.StereoMatches.of(pair.previous, pair.current, None, None, None)
         >>> found = jl.odometry.estimate_motion(rig, matches, jl.poses.SE3.identity(), key=jax.random.key(1))
-        >>> bool(found.estimate.ok)
+        >>> bool(found.ok)
         True
     """
-    initial_problem = motion_problem(rig, matches, prediction, GemanMcClure(options.kernel))
-    start = _best_start(rig, matches, initial_problem, prediction, key, options)
+    initial_problem = motion_problem(rig, matches, initial, GemanMcClure(options.kernel))
+    start = _best_start(rig, matches, initial_problem, initial, key, options)
     robust = motion_problem(rig, matches, start, GemanMcClure(options.kernel))
     rough = solve_graduated(robust, start, factors=(4.0, 2.0), max_steps=15).value
     rough = jax.tree.map(jax.lax.stop_gradient, rough)
@@ -90,7 +88,7 @@ def estimate_motion(
     final = motion_problem(rig, eqx.tree_at(lambda m: m.valid, matches, inliers), rough, Quadratic())
     estimate = solve(final, rough, max_steps=15)
     enough = jnp.sum(inliers) >= options.min_inliers
-    return CameraMotion(eqx.tree_at(lambda e: e.ok, estimate, estimate.ok & enough), inliers)
+    return RobustEstimate(eqx.tree_at(lambda e: e.ok, estimate, estimate.ok & enough), inliers)
 
 
 class _OffsetMotion(Problem):
@@ -112,7 +110,7 @@ class _OffsetMotion(Problem):
 
 
 @eqx.filter_jit
-def estimate_disparity_offset(rig: StereoRig, matches: StereoMatches, motion: CameraMotion) -> Estimate:
+def estimate_disparity_offset(rig: StereoRig, matches: StereoMatches, motion: RobustEstimate) -> Estimate:
     """Estimates a constant offset of the disparities jointly with the motion (self-calibration).
 
     A disparity that is too small by a constant makes far points move too far. One motion determines the offset poorly;
@@ -143,11 +141,11 @@ def _best_start(
     rig: StereoRig,
     matches: StereoMatches,
     problem: StereoReprojection,
-    prediction: SE3,
+    initial: SE3,
     key: Key[Array, ""],
     options: MotionOptions,
 ) -> SE3:
-    """The prediction, or the P3P sample that clearly more matches agree with."""
+    """The initial value, or the P3P sample if clearly more matches agree with it."""
     rays = rig.camera.bearing(matches.current[:, jnp.array([0, 2])])
     data = {"points": problem.points.T, "rays": rays}
     found = ransac(
@@ -160,10 +158,10 @@ def _best_start(
         key=key,
         valid=problem.valid,
     )
-    ratio = _distances(problem, prediction, data) / options.threshold
-    predicted_cost = jnp.sum(jnp.where(problem.valid, jnp.minimum(ratio**2, 1.0), 0.0))
-    sampled = found.ok & (found.score < 0.95 * predicted_cost)
-    return jax.tree.map(lambda a, b: jax.lax.stop_gradient(jnp.where(sampled, a, b)), found.model, prediction)
+    ratio = _distances(problem, initial, data) / options.threshold
+    initial_cost = jnp.sum(jnp.where(problem.valid, jnp.minimum(ratio**2, 1.0), 0.0))
+    sampled = found.ok & (found.score < 0.95 * initial_cost)
+    return jax.tree.map(lambda a, b: jax.lax.stop_gradient(jnp.where(sampled, a, b)), found.model, initial)
 
 
 def _poses_of_three(sample: Any) -> Candidates:

@@ -17,12 +17,13 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Closeness, Gaussian, MahalanobisDistance, Mixture
 from jaxloc.filters import ConstantVelocity, KalmanFilter
-from jaxloc.odometry import CameraMotion, FlowOptions, GroupOptions, MovingObjects, find_moving, group_points
+from jaxloc.odometry import FlowOptions, GroupOptions, MovingObjects, find_moving, group_points
 from jaxloc.pipelines.odometry import Config as OdometryConfig
 from jaxloc.pipelines.odometry import Evidence, steps_with_evidence
 from jaxloc.pipelines.odometry import Step as OdometryStep
 from jaxloc.poses import SE3
 from jaxloc.sensors import MovingObject, MovingObjectSensor, StereoRig
+from jaxloc.solvers import RobustEstimate
 from jaxloc.tracking import FieldOfView, GmPhd, MeasuredBirth, PhdState, TargetModel, Targets, UniformClutter
 
 
@@ -296,7 +297,7 @@ def _exact(pose: SE3) -> Gaussian:
     return Gaussian(pose, jnp.zeros((6, 6), pose.translation.dtype))
 
 
-def _given(motion: CameraMotion, pose: SE3) -> CameraMotion:
+def _given(motion: RobustEstimate, pose: SE3) -> RobustEstimate:
     """A motion known otherwise, in place of the one that was estimated."""
     zero = jnp.zeros_like(motion.estimate.covariance)
     return eqx.tree_at(lambda m: (m.estimate.value, m.estimate.covariance), motion, (pose, zero))

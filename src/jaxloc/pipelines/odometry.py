@@ -17,7 +17,6 @@ from jaxtyping import Array, Key
 from jaxloc.beliefs import Gaussian, compounding
 from jaxloc.features import opencv
 from jaxloc.odometry import (
-    CameraMotion,
     MatchingOptions,
     MotionOptions,
     StereoFeatures,
@@ -29,6 +28,7 @@ from jaxloc.odometry import (
 from jaxloc.poses import SE3
 from jaxloc.refinement import StereoMatches
 from jaxloc.sensors import StereoRig
+from jaxloc.solvers import RobustEstimate
 
 
 class Config(eqx.Module):
@@ -105,7 +105,7 @@ class Evidence(eqx.Module):
     reference: StereoFeatures
     current: StereoFeatures
     matches: StereoMatches
-    motion: CameraMotion
+    motion: RobustEstimate
     age: int
 
 
@@ -223,7 +223,7 @@ def _measure(
     key: Key[Array, ""],
     config: Config,
     watch: _Stopwatch,
-) -> tuple[StereoMatches, CameraMotion]:
+) -> tuple[StereoMatches, RobustEstimate]:
     """Matches with the keyframe and the motion since then."""
     with watch.stage("track"):
         matches = match_frames(rig, keyframe.features, features, prediction, options=config.matching)
@@ -300,7 +300,7 @@ def _first_step(frame: Any, pose: Gaussian, watch: _Stopwatch) -> Step:
 
 
 def _step(
-    frame: Any, pose: Gaussian, relative: Gaussian, matches: Any, found: CameraMotion, ok: bool, watch: _Stopwatch
+    frame: Any, pose: Gaussian, relative: Gaussian, matches: Any, found: RobustEstimate, ok: bool, watch: _Stopwatch
 ) -> Step:
     valid, inlier = np.asarray(matches.valid), np.asarray(found.inliers)
     return Step(

@@ -19,7 +19,7 @@ from jaxloc.solvers.graduated_nonconvexity import solve_graduated
 from jaxloc.solvers.least_squares import solve
 from jaxloc.solvers.point_alignment import PointAlignment, Similarity, align_points, align_scaled_points
 from jaxloc.solvers.problem import FunctionProblem, Linearization, Problem
-from jaxloc.solvers.ransac import Candidates, Consensus, ransac, required_hypotheses
+from jaxloc.solvers.ransac import Candidates, Consensus, RobustEstimate, ransac, required_hypotheses
 from jaxloc.solvers.robust_kernels import Barron, Cauchy, GemanMcClure, Huber, Loss, Quadratic, Tukey
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "PointAlignment",
     "Problem",
     "Quadratic",
+    "RobustEstimate",
     "Similarity",
     "Solver",
     "Status",

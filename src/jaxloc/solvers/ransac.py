@@ -9,6 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc.beliefs import Gaussian
+from jaxloc.solvers.estimate import Estimate
+
 
 class Candidates(eqx.Module):
     """Several models of one sample (P3P has up to four), for a ``fit`` that may return them.
@@ -36,6 +39,72 @@ class Consensus(eqx.Module):
     inliers: Bool[Array, " n"]
     score: Float[Array, ""]
     ok: Bool[Array, ""]
+
+
+class RobustEstimate(eqx.Module):
+    """An estimate from data with outliers, and the inliers it rests on.
+
+    The fields of `Estimate` can be read from the record itself (stacked ones from a stacked record).
+
+    Attributes:
+        estimate: value, covariance and whether they can be used.
+        inliers: items of the given data that agree with the value.
+    """
+
+    estimate: Estimate
+    inliers: Bool[Array, " n"]
+
+    @property
+    def value(self) -> Any:
+        """The estimate's value."""
+        return self.estimate.value
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance in the tangent space of the value."""
+        return self.estimate.covariance
+
+    @property
+    def cost(self) -> Array:
+        """The objective at the value."""
+        return self.estimate.cost
+
+    @property
+    def ok(self) -> Array:
+        """Whether value and covariance can be used."""
+        return self.estimate.ok
+
+    @property
+    def num_steps(self) -> Array:
+        """Solver steps taken."""
+        return self.estimate.num_steps
+
+    @property
+    def status(self) -> Array:
+        """A `Status` code."""
+        return self.estimate.status
+
+    @property
+    def information(self) -> Array:
+        """The Gauss-Newton Hessian at the value."""
+        return self.estimate.information
+
+    def gaussian(self) -> Gaussian:
+        """The estimate as a density."""
+        return self.estimate.gaussian()
+
+    def describe(self) -> str:
+        """One line of text: status, steps and cost (host only, one estimate)."""
+        return self.estimate.describe()
+
+    def check(self) -> "RobustEstimate":
+        """Itself, when it is ok (host only).
+
+        Raises:
+            ValueError: it is not; the message says why.
+        """
+        self.estimate.check()
+        return self
 
 
 @eqx.filter_jit
