@@ -1,4 +1,4 @@
-"""What this package needs of XLA beyond JAX's public functions: computing once, and keeping shards in place."""
+"""Control over what XLA does: results that are computed once, and arrays that stay laid out over devices."""
 
 from collections.abc import Callable
 from typing import Any
@@ -47,22 +47,21 @@ def compute_once(function: Callable[..., Array], *operands: Any) -> Array:
 def shard_like(new: Any, reference: Any) -> Any:
     """The arrays of a pytree, laid out over devices as the arrays of another, in order.
 
-    Without it, compilers may gather arrays that were indexed on each device. JAX 0.11.2 removed the function that asks
-    the compiler for this (`jax.experimental.shard_alike`, never public); there the layout is the compiler's choice.
+    Compilers may gather arrays that were indexed on each device, and JAX has no public function that asks for the
+    layout of an array whose mesh has automatic axes. So each new array passes through a selection between itself and
+    its reference, whose operands must be laid out alike; its predicate is always true, behind a barrier that keeps
+    the compiler from folding it. On one device this does nothing.
 
     Args:
         new: pytree of arrays.
-        reference: pytree with the layout, of as many arrays.
+        reference: pytree with the layout: as many arrays, of the same shapes.
 
     Returns:
         The first pytree.
     """
     if jax.device_count() == 1:
         return new
-    try:
-        from jax.experimental.shard_alike import shard_alike
-    except ImportError:
-        return new
     leaves, structure = jax.tree.flatten(new)
+    keep = lax.optimization_barrier(jnp.ones((), bool))
     pairs = zip(leaves, jax.tree.leaves(reference), strict=True)
-    return jax.tree.unflatten(structure, [shard_alike(one, other)[0] for one, other in pairs])
+    return jax.tree.unflatten(structure, [jnp.where(keep, one, other.astype(one.dtype)) for one, other in pairs])
