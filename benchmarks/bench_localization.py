@@ -56,8 +56,8 @@ def _step(drive: jl.data.LaserDrive, grid: OccupancyMap, count: int) -> Iterator
     chosen = jax.tree.map(lambda leaf: leaf[1:41], scans)
     valid = jnp.ones(chosen.ranges.shape, bool)
     truth = SE2(*(float(value) for value in drive.truth[0]))
-    near = filt.start_near(jl.beliefs.Gaussian(truth, 0.01 * jnp.eye(3)), count, key=jax.random.key(0))
-    anywhere = filt.start_globally(count, key=jax.random.key(0))
+    near = filt.init_near(jl.beliefs.Gaussian(truth, 0.01 * jnp.eye(3)), count, key=jax.random.key(0))
+    anywhere = filt.init_globally(count, key=jax.random.key(0))
 
     def run(state):
         return jl.filters.run(filt, state, motions, chosen, valid, keep=_steps_only, key=jax.random.key(1))[1].infos.ess
@@ -77,7 +77,7 @@ def _step(drive: jl.data.LaserDrive, grid: OccupancyMap, count: int) -> Iterator
 def _rays(drive: jl.data.LaserDrive, grid: OccupancyMap) -> Iterator[Metric]:
     """The beam model: 2000 poses, 60 rays each."""
     sensor = BeamModel(DistanceField.of(grid, ceiling=5.0), max_range=20.0)
-    poses = grid.free_space().spread(2000, key=jax.random.key(0))
+    poses = grid.free_space().sample_evenly(2000, key=jax.random.key(0))
     scan = LaserScan(jnp.asarray(drive.log.ranges[0]), drive.log.angle_min, drive.log.angle_increment).thin(_BEAMS)
     weigh = jax.jit(jax.vmap(lambda pose: sensor.log_prob(pose, scan, jnp.array(True))))
     yield Metric("localization.beam_model_2000", 1e3 * quickest(lambda: weigh(poses)).wall, "ms", "lower", TIME)
@@ -105,7 +105,7 @@ def _building(folder: Path, num_seeds: int, num_tracked: int) -> Iterator[Metric
     start = jl.beliefs.Gaussian(SE2(*(float(v) for v in truth[0])), jnp.diag(jnp.array([0.04, 0.04, 0.01])))
     everything = slice(0, len(truth))
     runs = [
-        run(filt.start_near(start, 2000, key=jax.random.key(seed)), everything, jax.random.key(seed + 100))
+        run(filt.init_near(start, 2000, key=jax.random.key(seed)), everything, jax.random.key(seed + 100))
         for seed in range(num_tracked)
     ]
     position, heading = (np.concatenate([found[part] for found in runs]) for part in (0, 1))
@@ -126,7 +126,7 @@ def _global_starts(filt: MonteCarloLocalization, run, count: int, num_seeds: int
     for name, starts in (("", [0] * num_seeds), (".anywhere", np.linspace(0, count - 101, num_seeds).astype(int))):
         ends, needed = [], []
         for seed, first in enumerate(starts):
-            state = filt.start_globally(_GLOBAL, key=jax.random.key(seed))
+            state = filt.init_globally(_GLOBAL, key=jax.random.key(seed))
             error, _ = run(state, slice(int(first), int(first) + 100), jax.random.key(seed + 200))
             wrong = np.flatnonzero(error > 1.0)
             ends.append(np.median(error[-10:]) < 0.25)

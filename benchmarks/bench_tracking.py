@@ -15,18 +15,10 @@ from jaxloc.beliefs import Mixture
 from jaxloc.data.simulate.targets import LinearScenario, TargetScenario, TurningScenario, simulate_targets
 from jaxloc.evaluation.targets.ospa import ospa
 from jaxloc.filters import ExtendedKalmanFilter, Filter, KalmanFilter, SigmaPointFilter, Unscented, run
-from jaxloc.tracking import GmCphd, GmPhd, PointBirth, StaticBirth, TargetModel, UniformClutter, gmphd
+from jaxloc.tracking import GmCphd, GmPhd, PointBirth, StaticBirth, TargetModel, UniformClutter
 
 _GATE = 0.999
 _CASES = ("phd.clutter10", "phd.clutter50", "phd.clutter60", "phd.extended", "phd.unscented", "cphd.clutter50")
-
-
-class Copied(GmPhd):
-    """As published: a component of weight w is ``round(w)`` targets."""
-
-    def extract(self, state: Any) -> jl.tracking.Targets:
-        """With copies."""
-        return gmphd.extract(state.mixture, threshold=self.extraction)
 
 
 def metrics(smoke: bool) -> Iterator[Metric]:
@@ -53,10 +45,12 @@ def model_of(scenario: TargetScenario, filt: Filter) -> TargetModel:
     )
 
 
-def linear(rate: float, **room: int) -> tuple[LinearScenario, Copied]:
-    """The linear scenario, and its filter."""
+def linear(rate: float, **room: int) -> tuple[LinearScenario, GmPhd]:
+    """The linear scenario, and its filter as published: a component of weight w is ``round(w)`` targets."""
     scenario = LinearScenario(clutter_rate=rate)
-    return scenario, Copied(model_of(scenario, KalmanFilter(scenario.motion, scenario.sensor)), gate=_GATE, **room)
+    return scenario, GmPhd(
+        model_of(scenario, KalmanFilter(scenario.motion, scenario.sensor)), gate=_GATE, copies=True, **room
+    )
 
 
 def nobody(scenario: TargetScenario) -> Mixture:
@@ -89,7 +83,7 @@ def _accuracy(runs: int, scans: int, chosen: tuple[str, ...]) -> Iterator[Metric
     }
     crowded, phd = linear(50.0)
     cases = {f"phd.clutter{rate}": linear(float(rate)) for rate in (10, 50, 60)}
-    cases |= {f"phd.{name}": (turning, Copied(model_of(turning, filt))) for name, filt in filters.items()}
+    cases |= {f"phd.{name}": (turning, GmPhd(model_of(turning, filt), copies=True)) for name, filt in filters.items()}
     cases["cphd.clutter50"] = (crowded, GmCphd(phd, max_targets=30))
     for name in chosen:
         scenario, tracker = cases[name]

@@ -15,7 +15,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxloc as jl
-from jaxloc.tracking import gmphd
 
 FAST = "JAXLOC_FAST" in os.environ
 plt.rcParams["figure.dpi"] = 70
@@ -137,12 +136,12 @@ far = jl.beliefs.Mixture(
     jnp.ones(2), jnp.array([[0.0, 0, 0, 0], [1000.0, 0, 0, 0]]), jnp.stack([100.0 * jnp.eye(4)] * 2)
 )
 seen, there = jnp.array([[5.0, 0.0]]), jnp.array([True])
-after, _ = gmphd.update(far, seen, there, phd)
+after, _ = phd.update(phd.init(far), seen, there)
 cphd = jl.tracking.GmCphd(phd)
 state = cphd.init(far)
 certain = jl.tracking.CphdState(state.mixture, jnp.zeros(31).at[2].set(1.0), state.step, state.num_labels)
 spooky, _ = cphd.update(certain, seen, there)
-for name, mixture in (("PHD", after), ("CPHD", spooky.mixture)):
+for name, mixture in (("PHD", after.mixture), ("CPHD", spooky.mixture)):
     missed = mixture.means[:, 0] > 500.0
     here, away = (float(jnp.sum(jnp.where(mask, mixture.weights, 0.0))) for mask in (~missed, missed))
     print(f"{name:<5} measured one {here:.2f}, missed one {away:.2f}")

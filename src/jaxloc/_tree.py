@@ -39,3 +39,15 @@ def detach_unless(ok: Bool[Array, ""], tree: Any) -> Any:
         0.0
     """
     return jax.tree.map(lambda a: jnp.where(ok, a, jax.lax.stop_gradient(a)) if eqx.is_inexact_array(a) else a, tree)
+
+
+def all_finite(tree: Any) -> Bool[Array, ""]:
+    """Whether all floating-point numbers of a pytree are finite; without derivatives.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> bool(all_finite((jnp.ones(2), jnp.array(jnp.inf))))
+        False
+    """
+    leaves = [jax.lax.stop_gradient(leaf) for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))

@@ -29,11 +29,11 @@ def test_intensity_and_moments_are_scipys(parts, dtype):
 
     share = weights / weights.sum()
     mean = share @ means
-    spread = sum(s * (P + np.outer(m - mean, m - mean)) for s, m, P in zip(share, means, covariances, strict=True))
+    expected = sum(s * (P + np.outer(m - mean, m - mean)) for s, m, P in zip(share, means, covariances, strict=True))
     whole = mixture.gaussian()
     assert whole.mean.dtype == dtype
     np.testing.assert_allclose(whole.mean, mean, atol=10 * tolerance)
-    np.testing.assert_allclose(whole.covariance, spread, atol=10 * tolerance)
+    np.testing.assert_allclose(whole.covariance, expected, atol=10 * tolerance)
     roots = np.asarray(mixture.roots())
     np.testing.assert_allclose(roots @ roots.swapaxes(-1, -2), covariances, atol=10 * tolerance)
 
@@ -51,10 +51,10 @@ def test_components_are_chosen_joined_and_scaled(parts):
     assert mixture.padded(2).capacity == 4
 
 
-def test_an_empty_mixture_is_nothing_without_bad_numbers():
-    nobody = jl.beliefs.Mixture.empty(3, jnp.zeros(2))
-    assert float(nobody.mass) == 0.0 and float(nobody.log_intensity(jnp.zeros(2))) == -np.inf
-    assert bool(jnp.all(jnp.isfinite(nobody.gaussian().covariance)))
+def test_an_empty_mixture_is_nothing_without_nonfinite_values():
+    empty = jl.beliefs.Mixture.empty(3, jnp.zeros(2))
+    assert float(empty.mass) == 0.0 and float(empty.log_intensity(jnp.zeros(2))) == -np.inf
+    assert bool(jnp.all(jnp.isfinite(empty.gaussian().covariance)))
     poses = jl.beliefs.Mixture.empty(3, jl.poses.SE2(0.0, 0.0, 0.0))
     assert poses.covariances.shape == (3, 3, 3) and poses.means.translation.shape == (3, 2)
 
@@ -101,8 +101,8 @@ def test_gradient_of_intensity_is_that_of_finite_differences(parts):
     ],
 )
 def test_numbers_without_sense_are_refused_at_the_edge(weights, covariance, match):
-    spreads = jnp.stack([jnp.eye(2), jnp.array(covariance)])
-    bad = jl.beliefs.Mixture(jnp.array(weights), jnp.zeros((2, 2)), spreads)
+    covariances = jnp.stack([jnp.eye(2), jnp.array(covariance)])
+    bad = jl.beliefs.Mixture(jnp.array(weights), jnp.zeros((2, 2)), covariances)
     with pytest.raises(ValueError, match=match):
         bad.check()
     assert jax.jit(lambda mixture: mixture.check().mass)(bad).shape == ()

@@ -40,10 +40,10 @@ def greedy(weights, means, covariances, distance, threshold, capacity):
         group = [k for k in left if k == lead or distance(means, covariances, k, lead) <= threshold]
         total = weights[group].sum()
         mean = weights[group] @ means[group] / total
-        spread = sum(
+        scatter = sum(
             weights[k] * (covariances[k] + np.outer(means[k] - mean, means[k] - mean)) for k in group
         )  # fmt: skip
-        parts.append((total, mean, spread / total, lead))
+        parts.append((total, mean, scatter / total, lead))
         left = [k for k in left if k not in group]
     return sorted(parts, key=lambda part: -part[0])[:capacity], max(len(parts) - capacity, 0)
 

@@ -68,10 +68,10 @@ def test_two_modes_separate_the_three_estimates():  # R-8
     assert np.isclose(float(near.x), weights @ x / weights.sum(), atol=1e-4)
 
 
-def test_zero_and_bad_weights():
+def test_zero_and_nonfinite_weights():
     values = jnp.arange(4.0)[:, None]
-    bad = Particles(values, jnp.array([jnp.nan, -jnp.inf, jnp.inf, jnp.nan]))
-    assert not bad.ok and np.allclose(bad.mean(), 1.5) and np.isclose(bad.ess, 4.0)
+    degenerate = Particles(values, jnp.array([jnp.nan, -jnp.inf, jnp.inf, jnp.nan]))
+    assert not degenerate.ok and np.allclose(degenerate.mean(), 1.5) and np.isclose(degenerate.ess, 4.0)
     masked = Particles(values, None, jnp.array([True, False, True, False]))
     assert np.allclose(masked.weights, [0.5, 0.0, 0.5, 0.0]) and int(masked.count) == 2
     assert np.allclose(masked.covariance(), 1.0) and np.isclose(masked.log_mean_weight, 0.0)

@@ -85,10 +85,10 @@ def test_poses_agree_with_monte_carlo(x64, rng, name):
     image = methods()[name](drive, gaussian)
     draws = jax.vmap(drive)(gaussian.sample(40000, key=jax.random.key(7)))
     deltas = np.asarray(jax.vmap(lambda x: local(image.mean, x))(draws))
-    spread = np.cov(deltas.T)
-    assert np.linalg.norm(image.covariance - spread) < 0.08 * np.linalg.norm(spread)
+    expected = np.cov(deltas.T)
+    assert np.linalg.norm(image.covariance - expected) < 0.08 * np.linalg.norm(expected)
     if name != "linear":
-        assert np.abs(deltas.mean(0)).max() < 0.05 * np.sqrt(np.trace(spread))
+        assert np.abs(deltas.mean(0)).max() < 0.05 * np.sqrt(np.trace(expected))
 
 
 def test_linear_equals_compounding(x64, rng):  # K-4

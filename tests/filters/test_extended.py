@@ -195,7 +195,7 @@ def test_gradients_by_every_array(x64, rng):
         assert np.isclose(np.sum(np.asarray(slope) * way), (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-6)
 
 
-def test_bad_options_are_named():
+def test_wrong_options_are_named():
     with pytest.raises(ValueError, match="at least 1 iteration"):
         ExtendedKalmanFilter(*models(), iterations=0)
     with pytest.raises(ValueError, match="probability"):

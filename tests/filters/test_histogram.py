@@ -16,7 +16,7 @@ def test_equals_the_kalman_filter(x64, rng):
     readings, valid = jnp.asarray(rng.normal(size=(8, 1))), jnp.asarray(rng.uniform(size=8) < 0.8)
     ours, theirs = GridFilter(motion, sensor), KalmanFilter(motion, sensor)
     cells = histogram.box((-12.0,), (12.0,), (241,))
-    last, history = run(ours, ours.spread(cells, prior), None, readings, valid)
+    last, history = run(ours, ours.init_gaussian(cells, prior), None, readings, valid)
     exact, peer = run(theirs, theirs.init(prior), None, readings, valid)
     found = last.gaussian()
     assert np.allclose(found.mean, exact.mean, atol=1e-6) and np.allclose(found.covariance, exact.covariance, atol=1e-5)
@@ -66,7 +66,7 @@ def test_poses_conserve_mass_and_wrap():
     assert np.abs(local(SE2(0.0, 0.0, jnp.pi), mean)).max() < 0.1
 
 
-def test_bad_readings_change_nothing():
+def test_nonfinite_measurements_change_nothing():
     eye = jnp.eye(1)
     filt = GridFilter(LinearMotion(eye, eye), LinearSensor(eye, 1e-3 * eye))
     state = filt.init(histogram.box((-3.0,), (3.0,), (13,)))
@@ -84,7 +84,7 @@ def test_bad_readings_change_nothing():
         assert value == 0.0 and np.isfinite(slope).all()
 
 
-def test_bad_boxes_are_named():
+def test_wrong_boxes_are_named():
     with pytest.raises(ValueError, match="equal length"):
         histogram.box((0.0,), (1.0, 2.0), (3,))
     with pytest.raises(ValueError, match="empty"):

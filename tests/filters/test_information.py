@@ -32,7 +32,7 @@ def both():
         @jax.jit
         def everything(data):
             history, peer = run(ours, ours.init(prior), *data)[1], run(theirs, theirs.init(prior), *data)[1]
-            last, blank = run(ours, ours.nothing(3), *data)
+            last, blank = run(ours, ours.init_uninformative(3), *data)
             known = jax.vmap(lambda state: state.determined)(blank.states)
             density = jax.vmap(lambda state: state.gaussian())(history.states)
             return density, history.infos, peer, (last.mean, known, blank)
@@ -82,13 +82,13 @@ def test_nothing_is_known_at_first(both):
 
 
 @pytest.mark.parametrize("bad", [np.nan, 1e30])
-def test_bad_readings_change_nothing(bad):
+def test_nonfinite_measurements_change_nothing(bad):
     motion, sensor, _ = parts(np.float32)
     filt = InformationFilter(motion, sensor)
 
     @jax.jit
     def after(reading):
-        state, info = filt.update(filt.predict(filt.nothing(3), jnp.zeros(2)), reading, jnp.array(True))
+        state, info = filt.update(filt.predict(filt.init_uninformative(3), jnp.zeros(2)), reading, jnp.array(True))
         return jnp.sum(state.mean) + jnp.sum(state.information), (state, info)
 
     (value, (state, info)), gradient = jax.value_and_grad(after, has_aux=True)(jnp.array([1.0, bad]))

@@ -139,7 +139,7 @@ def test_smoother_is_near_the_exact_posterior(results):
     assert np.abs(np.asarray(combined[1]) - means).max() < 0.2
 
 
-def test_one_that_is_not_there_and_bad_shapes(results):
+def test_one_that_is_not_there_and_wrong_shapes(results):
     _, (_, (_, _, _, last)), _ = results
     filt = bank(jnp.asarray(TRANSITION, jnp.float32))
     with pytest.raises(ValueError, match=r"shape \(2, 2\)"):

@@ -54,9 +54,9 @@ class World:
         errors = relative_poses(poses.astype(float), self.truth[steps])
         return state, history, np.hypot(errors[:, 0], errors[:, 1]), np.degrees(np.abs(errors[:, 2]))
 
-    def start_near(self, index, key, count=PARTICLES):
+    def init_near(self, index, key, count=PARTICLES):
         pose = SE2(*(float(value) for value in self.truth[index]))
-        return self.filt.start_near(Gaussian(pose, jnp.diag(jnp.array([0.04, 0.04, 0.01]))), count, key=key)
+        return self.filt.init_near(Gaussian(pose, jnp.diag(jnp.array([0.04, 0.04, 0.01]))), count, key=key)
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +68,10 @@ def world():
 @pytest.fixture(scope="module")
 def tracked(world):
     key = jax.random.key(1)
-    return world.run(world.start_near(0, jax.random.key(0)), np.arange(STEPS), key)
+    return world.run(world.init_near(0, jax.random.key(0)), np.arange(STEPS), key)
 
 
-def test_a_known_start_is_tracked_with_honest_covariances(world, tracked):
+def test_a_known_initial_pose_is_tracked_with_consistent_covariances(world, tracked):
     _, history, position, heading = tracked
     assert np.median(position) < 0.04 and np.percentile(position, 95) < 0.1 and np.median(heading) < 0.6
     assert (history.infos.place.mass > 0.99).mean() > 0.9 and history.infos.ok.all()
@@ -80,10 +80,10 @@ def test_a_known_start_is_tracked_with_honest_covariances(world, tracked):
     assert 0.2 < float(jnp.mean(nees)) < 6.0
 
 
-def test_a_global_start_finds_the_robot(world):
+def test_global_localization_finds_the_robot(world):
     ends = []
     for seed in range(3):
-        state = world.filt.start_globally(PARTICLES, key=jax.random.key(seed))
+        state = world.filt.init_globally(PARTICLES, key=jax.random.key(seed))
         _, history, position, _ = world.run(state, np.arange(30, 30 + STEPS), jax.random.key(seed + 10))
         ends.append(position[-10:].max())
         # No scan leaves fewer particles than asked for, although the first would leave a handful.
@@ -91,9 +91,9 @@ def test_a_global_start_finds_the_robot(world):
     assert max(ends) < 0.25
 
 
-def test_a_robot_that_was_carried_away_is_found_again(world):
+def test_a_kidnapped_robot_is_found_again(world):
     steps = np.r_[0:20, 140 : 140 + STEPS - 20]
-    _, history, position, _ = world.run(world.start_near(0, jax.random.key(0)), steps, jax.random.key(2))
+    _, history, position, _ = world.run(world.init_near(0, jax.random.key(0)), steps, jax.random.key(2))
     assert position[:20].max() < 0.5 and position[-5:].max() < 0.3
     inject = np.asarray(history.infos.inject)
     assert inject[20:].max() > 0.1 and inject[:20].max() < 0.1
@@ -101,7 +101,7 @@ def test_a_robot_that_was_carried_away_is_found_again(world):
 
 def test_runs_resume_to_the_same_numbers(world, tracked):
     key = jax.random.key(1)
-    state, steps = world.start_near(0, jax.random.key(0)), np.arange(STEPS)
+    state, steps = world.init_near(0, jax.random.key(0)), np.arange(STEPS)
     # A step that is not active changes nothing, so that both halves have the shape of the whole.
     half, _, first, _ = world.run(state, steps, key, active=jnp.asarray(steps < 25))
     rolled = np.concatenate([steps[25:], steps[:25]])
@@ -143,11 +143,11 @@ def test_measurements_that_fit_nowhere_are_no_error(world, tracked, value):
     np.testing.assert_array_equal(after.particles.values.translation, tracked[0].particles.values.translation)
     again = filt.predict(after, SE2(0.0, 0.0, 0.0), key=jax.random.key(0))
     moved = jnp.hypot(*(again.particles.values.translation - after.particles.values.translation).T) > 1.0
-    assert 0.3 < float(moved.mean()) < 0.6  # half of the cloud is anywhere now
+    assert 0.3 < float(moved.mean()) < 0.6  # half of the particles are random now
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(again) if eqx.is_inexact_array(leaf))
 
 
-def test_resizing_keeps_the_belief(world, tracked):
+def test_resizing_keeps_the_density(world, tracked):
     state = tracked[0]
     small = world.filt.resize(state, 500, key=jax.random.key(0))
     assert small.particles.size == 500
@@ -160,7 +160,7 @@ def test_adaptive_sizes_mask_particles(world):
     filt = make_filter(
         simulate_laser_drive(seed=3).building.map(), (0.1, 0.0, 0.0), adaptive=KLDSize(jnp.array([0.2, 0.2, 0.1]))
     )
-    state = filt.start_globally(PARTICLES, key=jax.random.key(0))
+    state = filt.init_globally(PARTICLES, key=jax.random.key(0))
     counts = []
     for index in range(12):
         scan = jax.tree.map(lambda leaf, index=index: leaf[index + 30], world.scans)
@@ -189,7 +189,7 @@ def test_double_precision_is_kept(x64):
     grid = type(grid)(grid.probability.astype(jnp.float64), 0.05, SE2(jnp.asarray(-0.5), -0.5, 0.0))
     field = DistanceField.of(grid)
     filt = MonteCarloLocalization(OdometryMotion(dtype=jnp.float64), LikelihoodField(field), grid.free_space())
-    state = filt.start_globally(64, key=jax.random.key(0))
+    state = filt.init_globally(64, key=jax.random.key(0))
     state = filt.predict(state, SE2(jnp.asarray(0.1), 0.0, 0.0), key=jax.random.key(1))
     scan = LaserScan(jnp.asarray(drive.log.ranges[0], jnp.float64), -1.57, 0.0174)
     state, info = filt.update(state, scan, jnp.array(True))
@@ -201,7 +201,7 @@ def test_wrong_arguments(world):
     with pytest.raises(TypeError, match="Gaussian"):
         world.filt.init(Gaussian(SE2(0.0, 0.0, 0.0), jnp.eye(3)))
     with pytest.raises(ValueError, match="need a key"):
-        world.filt.predict(world.start_near(0, jax.random.key(0)), SE2(0.0, 0.0, 0.0))
+        world.filt.predict(world.init_near(0, jax.random.key(0)), SE2(0.0, 0.0, 0.0))
 
 
 def test_the_fit_decides_how_much_is_replaced():
@@ -227,6 +227,6 @@ def test_a_real_building(recordings):
     filt = make_filter(ros_map.read_map(folder / "map_from_even_scans.yaml"), log.mount)
     world = World(filt, odd, keyframes["ref"][1::2])
     _, _, position, heading = world.run(
-        world.start_near(0, jax.random.key(0), 2000), np.arange(len(odd.odometry)), jax.random.key(1)
+        world.init_near(0, jax.random.key(0), 2000), np.arange(len(odd.odometry)), jax.random.key(1)
     )
     assert np.median(position) <= 0.05 and np.median(heading) <= 0.65 and np.percentile(position, 95) <= 0.25

@@ -58,9 +58,9 @@ class Direct(Sensor):
         return self.variance * jnp.eye(1, dtype=state.dtype)
 
 
-def growth(runs, steps, seed, q, r, start_variance, start=0.0):
+def growth(runs, steps, seed, q, r, start_variance, initial=0.0):
     rng = np.random.default_rng(seed)
-    x = start + np.sqrt(start_variance) * rng.normal(size=runs)
+    x = initial + np.sqrt(start_variance) * rng.normal(size=runs)
     states, readings = [], []
     for k in range(steps):
         x = 0.5 * x + 25 * x / (1 + x**2) + 8 * np.cos(1.2 * k) + np.sqrt(q) * rng.normal(size=runs)
@@ -69,16 +69,16 @@ def growth(runs, steps, seed, q, r, start_variance, start=0.0):
     return np.array(states).T, np.array(readings).T
 
 
-def growth_errors(runs, steps, particles, seed, q, r, start_variance, start=0.0):
+def growth_errors(runs, steps, particles, seed, q, r, start_variance, initial=0.0):
     """Squared errors of the weighted mean, over runs and steps."""
-    states, readings = growth(runs, steps, seed, q, r, start_variance, start)
+    states, readings = growth(runs, steps, seed, q, r, start_variance, initial)
     filt = ParticleFilter(Growth(jnp.full((1, 1), q)), Squared(jnp.full((1, 1), r)), ess_threshold=1.0)
 
     @jax.jit
     @jax.vmap
     def estimate(key, z):
         first, rest = jax.random.split(key)
-        prior = Gaussian(jnp.full(1, start), jnp.full((1, 1), start_variance))
+        prior = Gaussian(jnp.full(1, initial), jnp.full((1, 1), start_variance))
         state = filt.init(Particles.from_gaussian(prior, particles, key=first))
         controls, valid = jnp.arange(float(steps)), jnp.ones(steps, bool)
         return run(filt, state, controls, z, valid, keep=lambda s: s.particles.mean(), key=rest)[1].states
@@ -111,9 +111,12 @@ def exact(a, readings, noise=0.25):
     mean = variance = total = 0.0
     for reading in readings:
         mean, variance = a * mean, a * a * variance + 1.0
-        spread = variance + noise
-        total -= 0.5 * ((reading - mean) ** 2 / spread + np.log(2 * np.pi * spread))
-        mean, variance = mean + variance / spread * (reading - mean), variance * noise / spread
+        innovation_variance = variance + noise
+        total -= 0.5 * ((reading - mean) ** 2 / innovation_variance + np.log(2 * np.pi * innovation_variance))
+        mean, variance = (
+            mean + variance / innovation_variance * (reading - mean),
+            variance * noise / innovation_variance,
+        )
     return total
 
 
@@ -204,7 +207,7 @@ def test_no_measurement_changes_nothing(tracked):
     assert np.allclose(after.particles.values, state.particles.values)
 
 
-def test_impossible_measurement_keeps_and_spreads_the_cloud(tracked):
+def test_impossible_measurement_keeps_and_inflates_the_particles(tracked):
     class Never(Squared):
         def log_prob(self, state, measurement, valid):
             return jnp.full((), -jnp.inf)
@@ -222,14 +225,14 @@ def test_impossible_measurement_keeps_and_spreads_the_cloud(tracked):
 
 
 def test_padded_steps_and_resumed_runs(tracked):
-    filt, start = tracked
+    filt, initial = tracked
     readings = jnp.asarray(growth(1, 12, 1, 1.0, 1.0, 1.0)[1][0][:, None], jnp.float32)
     controls, valid, key = jnp.arange(1.0, 13.0), jnp.ones(12, bool), jax.random.key(4)
     active = jnp.arange(12) < 6
-    end, history = run(filt, start, controls, readings, valid, key=key)
-    half, first = run(filt, start, controls, readings.at[8].set(jnp.nan), valid, active=active, key=key)
+    end, history = run(filt, initial, controls, readings, valid, key=key)
+    half, first = run(filt, initial, controls, readings.at[8].set(jnp.nan), valid, active=active, key=key)
     assert np.array_equal(first.infos.log_likelihood[:6], history.infos.log_likelihood[:6])
-    assert int(half.step) == int(start.step) + 6
+    assert int(half.step) == int(initial.step) + 6
     shift = jnp.roll(jnp.arange(12), -6)
     resumed, _ = run(filt, half, controls[shift], readings[shift], valid, active=active, key=key)
     assert_same(resumed, end)

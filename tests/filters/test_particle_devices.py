@@ -1,4 +1,4 @@
-"""Particles spread over devices and processes: they stay where they are, and the numbers are those of one device."""
+"""Particles sharded over devices and processes: they stay where they are, and the numbers are those of one device."""
 
 import os
 import socket
@@ -28,7 +28,7 @@ def steps(state):
     keep = lambda state: state.particles.mean()
     return jl.filters.run(model(), state, None, readings, valid, keep=keep, key=jax.random.key(2))
 
-def spread(tree, mesh, axis="particles"):
+def shard(tree, mesh, axis="particles"):
     def put(leaf):
         names = (axis,) if leaf.ndim else ()
         return jax.device_put(leaf, NamedSharding(mesh, PartitionSpec(*names)))
@@ -41,25 +41,25 @@ EIGHT = (
 mesh = jax.make_mesh((8,), ("particles",), axis_types=(AxisType.Auto,))
 spec = PartitionSpec("particles")
 one, alone = cloud(), model().init(cloud())
-many = spread(one, mesh)
+many = shard(one, mesh)
 draw = jax.jit(lambda particles: jl.beliefs.resampling.Multinomial().resample(particles, key=jax.random.key(3)))
 single, shared = draw(one), draw(many)
 assert np.array_equal(single.ancestors, shared.ancestors)
 assert np.array_equal(single.particles.values, shared.particles.values)
 assert all(leaf.sharding.spec == spec for leaf in jax.tree.leaves(shared)), shared
-end, history = steps(spread(alone, mesh))
+end, history = steps(shard(alone, mesh))
 last, expected = steps(alone)
 assert np.array_equal(end.ancestors, last.ancestors)
 assert np.allclose(end.particles.values, last.particles.values, atol=1e-6)
 assert np.allclose(history.infos.log_likelihood, expected.infos.log_likelihood, atol=1e-4)
 assert all(leaf.sharding.spec == spec for leaf in jax.tree.leaves(end.particles)), end
-# A batch of filters spread over the devices.
+# A batch of filters sharded over the devices.
 batch = jax.tree.map(lambda leaf: jnp.stack([leaf] * 8), alone)
-shared = jax.jit(jax.vmap(steps))(spread(batch, mesh))
+shared = jax.jit(jax.vmap(steps))(shard(batch, mesh))
 assert shared[0].particles.values.sharding.spec == spec
 assert np.allclose(shared[1].infos.log_likelihood, expected.infos.log_likelihood, atol=1e-4)
 try:
-    model().init(spread(one, jax.make_mesh((8,), ("particles",), axis_types=(AxisType.Explicit,))))
+    model().init(shard(one, jax.make_mesh((8,), ("particles",), axis_types=(AxisType.Explicit,))))
 except ValueError as error:
     assert "AxisType.Auto" in str(error)
 else:

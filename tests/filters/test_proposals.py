@@ -101,7 +101,7 @@ def test_drafts_begin_used_up():
     after, _ = filt.update(state, jnp.asarray(READING, jnp.float32), jnp.array(True))
     assert np.array_equal(after.particles.values, state.particles.values)
     poses = jax.vmap(SE2)(jnp.ones(4), jnp.ones(4), jnp.ones(4))
-    assert Guided().begin(poses).roots.shape == (4, 3, 3)
+    assert Guided().init_noise(poses).roots.shape == (4, 3, 3)
 
 
 def test_score_is_zero_with_a_derivative():

@@ -35,13 +35,13 @@ def data(seed=0):
 
 
 def models(parts):
-    transition, noise, matrix, spread = map(jnp.asarray, parts)
-    return LinearMotion(transition, noise), LinearSensor(matrix, spread)
+    transition, noise, matrix, sensor_noise = map(jnp.asarray, parts)
+    return LinearMotion(transition, noise), LinearSensor(matrix, sensor_noise)
 
 
 def dense(parts, readings, valid, upto):
     """Posterior means and covariances of all states from the joint normal density, with measurements up to a step."""
-    transition, noise, matrix, spread = parts
+    transition, noise, matrix, sensor_noise = parts
     size = 3 * (STEPS + 1)
     effect = np.zeros((size, size))  # of (x0, w1, w2, ...)
     source = np.zeros((size, size))
@@ -59,7 +59,7 @@ def dense(parts, readings, valid, upto):
     for row, (k, i) in zip(rows, seen, strict=True):
         row[3 * k + 3 : 3 * k + 6] = matrix[i]
     values = np.array([readings[k, i] for k, i in seen])
-    gain = covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T + spread[0, 0] * np.eye(len(seen)))
+    gain = covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T + sensor_noise[0, 0] * np.eye(len(seen)))
     mean, covariance = gain @ values, covariance - gain @ rows @ covariance
     blocks = [slice(3 * k + 3, 3 * k + 6) for k in range(STEPS)]
     return np.array([mean[b] for b in blocks]), np.array([covariance[b, b] for b in blocks])
@@ -77,16 +77,16 @@ def results():
         def everything(readings):
             found = {}
             for name, filt in filters.items():
-                start = filt.init(Gaussian(jnp.zeros(3), jnp.eye(3)))
-                _, history = run(filt, start, None, readings, jnp.asarray(valid), active=active)
+                initial = filt.init(Gaussian(jnp.zeros(3), jnp.eye(3)))
+                _, history = run(filt, initial, None, readings, jnp.asarray(valid), active=active)
                 found[name] = smooth(filt, history, None, active=active)
             filt = filters["KalmanFilter"]
-            start = filt.init(Gaussian(jnp.zeros(3), jnp.eye(3)))
-            whole = run(filt, start, None, readings, jnp.asarray(valid), active=active)
+            initial = filt.init(Gaussian(jnp.zeros(3), jnp.eye(3)))
+            whole = run(filt, initial, None, readings, jnp.asarray(valid), active=active)
             found["history"] = whole[1]
             found["lag"] = smooth_fixed_lag(filt, whole[1], None, 3, active=active)
             found["parallel"] = run_parallel(
-                filt, start, None, readings, jnp.asarray(valid), active=active, num_blocks=4
+                filt, initial, None, readings, jnp.asarray(valid), active=active, num_blocks=4
             )[1]
             found["smooth_parallel"] = smooth_parallel(filt, whole[1], None, active=active, num_blocks=4)
             return found
@@ -126,10 +126,10 @@ def test_parallel_run_equals_the_sequential_one(results):
 def test_parallel_run_in_float32_and_its_gradient():
     parts, readings, valid = data(3)
     filt = KalmanFilter(*models([part.astype(np.float32) for part in parts]))
-    start = filt.init(Gaussian(jnp.zeros(3), jnp.eye(3)))
+    initial = filt.init(Gaussian(jnp.zeros(3), jnp.eye(3)))
 
     def total(readings, runner):
-        last, history = runner(filt, start, None, readings, jnp.asarray(valid))
+        last, history = runner(filt, initial, None, readings, jnp.asarray(valid))
         return jnp.sum(history.infos.log_likelihood) + jnp.sum(last.mean)
 
     runners = (run, lambda *args: run_parallel(*args, num_blocks=5))
@@ -164,10 +164,10 @@ class Fix(Sensor):
 def test_iterated_parallel_run_ends_at_the_most_probable_path(x64, rng):
     steps, deviations = 8, np.sqrt([0.01, 0.01, 0.05])
     filt = ExtendedKalmanFilter(TwistMotion(jnp.diag(jnp.asarray(deviations) ** 2)), Fix())
-    start = filt.init(Gaussian(SE2(0.0, 0.0, 0.0), jnp.diag(jnp.array([0.1, 0.1, 0.5]))))
+    initial = filt.init(Gaussian(SE2(0.0, 0.0, 0.0), jnp.diag(jnp.array([0.1, 0.1, 0.5]))))
     controls = BodyTwist(jnp.asarray(np.tile([1.0, 0.0, 0.5], (steps, 1))), jnp.ones(steps))
     readings = jnp.asarray(np.cumsum(rng.normal(size=(steps, 2)) * 0.3 + [0.2, 0.7], axis=0))
-    last, history = run_parallel(filt, start, controls, readings, jnp.ones(steps, bool), iterations=15, num_blocks=3)
+    last, history = run_parallel(filt, initial, controls, readings, jnp.ones(steps, bool), iterations=15, num_blocks=3)
     sequential = smooth(filt, history, controls)
     path = smooth_parallel(filt, history, controls, num_blocks=3)
     assert np.abs(path.mean.translation - sequential.mean.translation).max() < 0.05  # equal to first order
@@ -177,7 +177,7 @@ def test_iterated_parallel_run_ends_at_the_most_probable_path(x64, rng):
         poses = jax.vmap(SE2)(*flat.reshape(steps + 1, 3).T)
         before, after = (jax.tree.map(lambda leaf, s=s: leaf[s], poses) for s in (slice(None, -1), slice(1, None)))
         slips = jax.vmap(local)(jax.vmap(filt.motion.move)(before, controls), after) / deviations[None]
-        first = local(start.mean, jax.tree.map(lambda leaf: leaf[0], poses)) / np.sqrt([0.1, 0.1, 0.5])
+        first = local(initial.mean, jax.tree.map(lambda leaf: leaf[0], poses)) / np.sqrt([0.1, 0.1, 0.5])
         return jnp.concatenate([first, slips.ravel(), ((after.translation - readings) / 0.2).ravel()])
 
     guess = np.concatenate([[[0.0, 0.0, 0.0]], np.c_[readings, np.zeros(steps)]]).ravel()

@@ -22,7 +22,7 @@ def test_rules_integrate_polynomials(rule, degree):
         assert np.allclose(weights @ offsets**power, moments.get(power, 0.0), atol=1e-9)
 
 
-def test_bad_rules_are_named():
+def test_wrong_rules_are_named():
     with pytest.raises(ValueError, match="alpha"):
         Unscented(kappa=-3.0).points(3)
     with pytest.raises(ValueError, match="order"):
@@ -54,7 +54,7 @@ def oracle(rule, readings, valid, dt, mean, covariance):
     offsets, weights, weights_covariance = rule.points(2)
     means, total = [], 0.0
 
-    def spread(function, mean, covariance):
+    def transform(function, mean, covariance):
         points = mean + offsets @ np.linalg.cholesky(covariance).T
         images = np.array([function(point) for point in points])
         center = weights @ images
@@ -63,9 +63,9 @@ def oracle(rule, readings, valid, dt, mean, covariance):
         return center, (weights_covariance[:, None, None] * both[:, :, None] * both[:, None]).sum(0)
 
     for reading, here in zip(readings, valid, strict=True):
-        mean, both = spread(lambda x: [x[0] + dt * x[1], x[1] - dt * 9.8 * np.sin(x[0])], mean, covariance)
+        mean, both = transform(lambda x: [x[0] + dt * x[1], x[1] - dt * 9.8 * np.sin(x[0])], mean, covariance)
         covariance = both[:2, :2] + 0.01 * dt * np.eye(2)
-        center, both = spread(lambda x: [np.sin(x[0]), x[1] * np.cos(x[0])], mean, covariance)
+        center, both = transform(lambda x: [np.sin(x[0]), x[1] * np.cos(x[0])], mean, covariance)
         keep = np.flatnonzero(here)
         s = (both[:2, :2] + np.diag([0.01, 0.2]))[np.ix_(keep, keep)]
         across, error = both[2:, keep], (reading - center)[keep]
@@ -83,23 +83,23 @@ def test_equals_numpy(x64, rng, rule):
     readings, valid = 0.5 * rng.normal(size=(30, 2)), rng.uniform(size=(30, 2)) < 0.7
     mean, covariance = np.array([0.3, 0.1]), np.array([[0.3, 0.1], [0.1, 0.2]])
     filt = SigmaPointFilter(Swing(), Height(), rule)
-    start = filt.init(Gaussian(jnp.asarray(mean), jnp.asarray(covariance)))
-    last, history = run(filt, start, jnp.full(30, 0.05), jnp.asarray(readings), jnp.asarray(valid))
+    initial = filt.init(Gaussian(jnp.asarray(mean), jnp.asarray(covariance)))
+    last, history = run(filt, initial, jnp.full(30, 0.05), jnp.asarray(readings), jnp.asarray(valid))
     total, means, covariance = oracle(rule, readings, valid, 0.05, mean, covariance)
     assert np.allclose(history.states.mean, means, atol=1e-8)
     assert np.allclose(last.covariance, covariance, atol=1e-8)
     assert np.isclose(jnp.sum(history.infos.log_likelihood), total)
 
 
-def test_negative_weights_and_bad_readings_stay_finite():
+def test_negative_weights_and_nonfinite_readings_stay_finite():
     filt = SigmaPointFilter(Swing(), Height(), Unscented(0.01, 0.0, 0.0))
     readings = jnp.ones((6, 2)).at[1, 0].set(jnp.nan).at[2].set(1e30)
 
     @jax.jit
     @jax.value_and_grad
     def total(covariance):
-        start = filt.init(Gaussian(jnp.ones(2), covariance))
-        last, history = run(filt, start, jnp.full(6, 0.05), readings, jnp.ones(6, bool))
+        initial = filt.init(Gaussian(jnp.ones(2), covariance))
+        last, history = run(filt, initial, jnp.full(6, 0.05), readings, jnp.ones(6, bool))
         return jnp.sum(history.infos.log_likelihood) + jnp.sum(last.mean)
 
     for covariance in (jnp.eye(2), jnp.zeros((2, 2)), 1e6 * jnp.eye(2)):

@@ -50,12 +50,12 @@ def test_moves_within_pytrees(x64, rng):
 
 
 def test_derivatives(x64, rng):
-    start = directions(rng, 1)
-    start = jax.tree.map(lambda leaf: leaf[0], start)
+    base = directions(rng, 1)
+    base = jax.tree.map(lambda leaf: leaf[0], base)
     for delta in (jnp.zeros(2), jnp.array([0.3, -0.2]), jnp.array([0.05, 0.0])):
-        trip = lambda d: start.local(start.retract(d))  # noqa: E731
+        trip = lambda d: base.local(base.retract(d))  # noqa: E731
         np.testing.assert_allclose(jax.jacrev(trip)(delta), np.eye(2), atol=1e-12)
-        moved = lambda d: start.retract(d).vector  # noqa: E731
+        moved = lambda d: base.retract(d).vector  # noqa: E731
         steps = 1e-6 * np.eye(2)
         slopes = [(moved(delta + step) - moved(delta - step)) / 2e-6 for step in steps]
         np.testing.assert_allclose(jax.jacfwd(moved)(delta), np.stack(slopes, axis=1), atol=1e-9)
@@ -70,11 +70,11 @@ def test_lengths_stay_one_over_many_moves():
     np.testing.assert_allclose(np.linalg.norm(end.vector), 1.0, atol=2e-7)
 
 
-BAD = [[0.0, 0.0, 0.0], [np.nan, 1.0, 0.0], [np.inf, 0.0, 0.0], [1e-30, 0.0, 0.0], [1e30] * 3]
+DEGENERATE = [[0.0, 0.0, 0.0], [np.nan, 1.0, 0.0], [np.inf, 0.0, 0.0], [1e-30, 0.0, 0.0], [1e30] * 3]
 
 
-@pytest.mark.parametrize("vector", BAD)
-def test_bad_and_extreme_vectors(vector):
+@pytest.mark.parametrize("vector", DEGENERATE)
+def test_degenerate_and_extreme_vectors(vector):
     value, slope = jax.value_and_grad(lambda v: Direction.from_vector(v).vector[0])(jnp.array(vector, jnp.float32))
     assert np.isfinite(value) and np.all(np.isfinite(slope))
 

@@ -173,11 +173,11 @@ def test_relative_chain_and_its_growing_error(x64, rng):  # K-4
     @jax.jit
     def errors(noise):
         noisy = jax.vmap(lambda motion, d: motion.retract(d))(motions, noise)
-        start = SE3.identity(noise.dtype)
-        return jax.vmap(lambda a, b: a.local(b))(chain(start, motions), chain(start, noisy))
+        initial = SE3.identity(noise.dtype)
+        return jax.vmap(lambda a, b: a.local(b))(chain(initial, motions), chain(initial, noisy))
 
     found = np.asarray(jax.vmap(errors)(noise))
-    spread = np.array([np.trace(np.cov(found[:, k].T)) for k in range(1, steps + 1)])
+    dispersion = np.array([np.trace(np.cov(found[:, k].T)) for k in range(1, steps + 1)])
     # To first order the error after k steps is the sum of the noises carried to the last frame by adjoints.
     step = expm(small_adjoint(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.05])))
     covariance, predicted = np.zeros((6, 6)), []
@@ -186,7 +186,7 @@ def test_relative_chain_and_its_growing_error(x64, rng):  # K-4
         covariance = back @ covariance @ back.T + np.diag([4e-4] * 3 + [1e-4] * 3)
         predicted.append(np.trace(covariance))
     assert np.all(np.diff(predicted) > 0)
-    np.testing.assert_allclose(spread, predicted, rtol=0.25)
+    np.testing.assert_allclose(dispersion, predicted, rtol=0.25)
 
 
 def test_a_loop_does_not_close(x64, rng):  # K-5
@@ -216,8 +216,8 @@ def test_object_and_robot_localization_are_inverse(x64, rng):  # K-15
     np.testing.assert_allclose(truth.inverse().matrix(), T_object_robot, atol=1e-12)
 
 
-def test_dead_reckoning_of_a_kilometre_in_float32():
-    """1000 steps of 1 m with 3 mrad of yaw: small-angle branches that cancel drift by a metre here."""
+def test_dead_reckoning_of_a_kilometer_in_float32():
+    """1000 steps of 1 m with 3 mrad of yaw: small-angle branches that cancel drift by a meter here."""
     steps, yaw = 1000, 3e-3
     twist = np.array([1.0, 0.0, 0.0, 0.0, 0.0, yaw], np.float32)
     motions = jax.vmap(SE3.exp)(jnp.asarray(np.tile(twist, (steps, 1))))

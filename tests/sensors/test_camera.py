@@ -13,11 +13,9 @@ FIVE = (-0.28, 0.07, 0.0012, -0.0008, 0.01)
 FISHEYE = (0.018, -0.011, 0.004, -0.0012)
 
 
-def points_ahead(rng, dtype, n=40, spread=0.6):
+def points_ahead(rng, dtype, n=40, width=0.6):
     z = rng.uniform(2.0, 40.0, n)
-    return jnp.asarray(
-        np.stack([z * rng.uniform(-spread, spread, n), z * rng.uniform(-spread, spread, n), z], -1), dtype
-    )
+    return jnp.asarray(np.stack([z * rng.uniform(-width, width, n), z * rng.uniform(-width, width, n), z], -1), dtype)
 
 
 def a_pose(dtype=np.float64):
@@ -93,7 +91,7 @@ def test_object_and_robot_localization_are_one_problem(x64, rng):  # K-15
     assert np.allclose((T_camera_model @ T_world_camera).matrix(), np.eye(4), atol=1e-12)
 
 
-def test_points_without_a_picture(dtype):
+def test_points_without_an_image(dtype):
     camera = Pinhole(*INTRINSICS, lens=BrownConrady((-0.3, 0.0, 0.0, 0.0)))
     points = jnp.array([[0, 0, 5], [1, 2, 0], [1, 2, -3], [0, 0, 0], [1, 1, 1e-30], [30, 0, 10], [1e6, 0, 1e-5]], dtype)
     assert camera.in_front(points).tolist() == [True] + [False] * 6

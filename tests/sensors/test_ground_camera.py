@@ -45,7 +45,7 @@ def test_signs_are_those_of_the_docstring(x64):
     assert left > right
 
 
-def test_pose_and_homography_tell_the_same(x64):
+def test_pose_and_homography_agree(x64):
     ground = jl.sensors.GroundCamera(camera(), 1.4, 0.05, -0.02)
     points = jnp.column_stack([jnp.array(X), jnp.array(Y), jnp.zeros(4)])
     by_pose = ground.camera.project(ground.T_road_camera().inverse().apply(points))

@@ -22,18 +22,18 @@ def test_variances_are_those_of_the_formula(x64):
 def test_two_half_steps_err_as_one(x64):
     motion = IncrementMotion(turn_drive=0.0, turn_turn=0.0, turn_idle=0.0, side=0.05, drive=0.05)
     whole, half = step(2.0, [1.0, 0.0, 0.0]), step(1.0, [0.5, 0.0, 0.0])
-    start = SE2(0.3, 0.2, 0.4)
-    middle, jacobian = motion.linearize(motion.move(start, half), half)
-    twice = jacobian @ motion.covariance(start, half) @ jacobian.T + motion.covariance(middle, half)
-    np.testing.assert_allclose(twice, motion.covariance(start, whole), rtol=1e-12)
+    pose = SE2(0.3, 0.2, 0.4)
+    middle, jacobian = motion.linearize(motion.move(pose, half), half)
+    twice = jacobian @ motion.covariance(pose, half) @ jacobian.T + motion.covariance(middle, half)
+    np.testing.assert_allclose(twice, motion.covariance(pose, whole), rtol=1e-12)
 
 
 def test_jacobian_equals_differences(x64):
-    motion, control, start = IncrementMotion(), step(1.0, [1.0, 0.2, 0.5]), SE2(0.3, 0.2, 0.4)
-    moved, jacobian = motion.linearize(start, control)
+    motion, control, pose = IncrementMotion(), step(1.0, [1.0, 0.2, 0.5]), SE2(0.3, 0.2, 0.4)
+    moved, jacobian = motion.linearize(pose, control)
     for i in range(3):
         delta = jnp.zeros(3).at[i].set(1e-6)
-        ends = [local(moved, motion.move(retract(start, sign * delta), control)) for sign in (1.0, -1.0)]
+        ends = [local(moved, motion.move(retract(pose, sign * delta), control)) for sign in (1.0, -1.0)]
         np.testing.assert_allclose(jacobian[:, i], (ends[0] - ends[1]) / 2e-6, atol=1e-8)
 
 

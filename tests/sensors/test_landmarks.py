@@ -75,7 +75,7 @@ def test_at_the_landmark_all_is_finite(dtype):
     assert np.isfinite(value) and np.isfinite(slope)
 
 
-def test_bad_readings_are_replaced_and_refused():
+def test_nonfinite_readings_are_masked():
     for distance, bearing in ((jnp.nan, 0.0), (jnp.inf, 0.0), (1.0, jnp.nan), (-1.0, 0.0)):
         safe, usable = sanitize(reading_of(jnp.float32, 2, distance, bearing), jnp.array(True))
         assert not usable and int(safe.landmark) == 2

@@ -9,8 +9,8 @@ from jaxloc.solvers import Cholesky
 from jaxloc.solvers.cholesky import factor, rank_tolerance
 
 
-def positive(rng, size, spread=1.0):
-    root = rng.normal(size=(size, size + 3)) * np.geomspace(1.0, spread, size)[:, None]
+def positive(rng, size, ratio=1.0):
+    root = rng.normal(size=(size, size + 3)) * np.geomspace(1.0, ratio, size)[:, None]
     return root @ root.T
 
 
@@ -22,7 +22,7 @@ def answers(matrix, vector):
 
 @pytest.mark.parametrize("size", [1, 2, 6, 9, 12])
 def test_solve_and_inverse_equal_numpy(size, x64, rng):
-    matrix, vector = positive(rng, size, spread=1e3), rng.normal(size=size)
+    matrix, vector = positive(rng, size, ratio=1e3), rng.normal(size=size)
     solution, inverse, deficient = answers(jnp.asarray(matrix), jnp.asarray(vector))
     assert not bool(deficient)
     expected = np.linalg.inv(matrix)

@@ -90,21 +90,21 @@ def views(seeds, count, outliers, rng):
     truth = jax.vmap(SE3.exp)(jnp.asarray(rng.uniform(-0.5, 0.5, (seeds, 6)), jnp.float32))
     points = jax.vmap(lambda pose, p: pose.apply(p))(truth, jnp.asarray(rays * depth, jnp.float32))
     noise = rng.normal(size=pixels.shape)
-    bad = int(outliers * count)
-    noise[:, :bad] += rng.uniform(-60.0, 60.0, (seeds, bad, 2))
-    start = jax.vmap(lambda pose, d: pose.retract(d))(
+    count_outliers = int(outliers * count)
+    noise[:, :count_outliers] += rng.uniform(-60.0, 60.0, (seeds, count_outliers, 2))
+    initial = jax.vmap(lambda pose, d: pose.retract(d))(
         truth, jnp.asarray(0.05 * rng.normal(size=(seeds, 6)), jnp.float32)
     )
-    return truth, points, jnp.asarray(pixels + noise, jnp.float32), start
+    return truth, points, jnp.asarray(pixels + noise, jnp.float32), initial
 
 
 @eqx.filter_jit
-def normalized_errors(truth, points, pixels, start, loss):
-    def lane(truth, points, pixels, start):
-        found = refine_pose(Pinhole(*CAMERA), points, pixels, start, **loss)
+def normalized_errors(truth, points, pixels, initial, loss):
+    def lane(truth, points, pixels, initial):
+        found = refine_pose(Pinhole(*CAMERA), points, pixels, initial, **loss)
         return found.gaussian().mahalanobis_squared(truth), found.ok, found.num_steps
 
-    return jax.vmap(lane)(truth, points, pixels, start)
+    return jax.vmap(lane)(truth, points, pixels, initial)
 
 
 def test_covariance_of_a_camera_pose_is_consistent(rng):
@@ -173,5 +173,5 @@ def test_describe_and_check(status):
 
 def test_gaussian_carries_value_and_covariance():
     estimate = made(np.eye(3))
-    belief = estimate.gaussian()
-    assert belief.mean is estimate.value and belief.covariance is estimate.covariance
+    density = estimate.gaussian()
+    assert density.mean is estimate.value and density.covariance is estimate.covariance

@@ -9,7 +9,7 @@ from scipy.optimize import minimize_scalar
 from jaxloc.solvers import FunctionProblem, GemanMcClure, LevenbergMarquardt, Quadratic, Tukey, solve, solve_graduated
 
 
-def spread(state, data):
+def deviations(state, data):
     return state - data
 
 
@@ -20,7 +20,7 @@ def data(rng):
 
 
 def test_finds_the_global_minimum_where_descent_stays_with_the_outliers(data):
-    problem = FunctionProblem(spread, data, GemanMcClure(2.0))
+    problem = FunctionProblem(deviations, data, GemanMcClure(2.0))
     local = solve(problem, jnp.array(29.0), solver=LevenbergMarquardt())
     found = solve_graduated(problem, jnp.array(29.0))
     values = np.asarray(data, np.float64)
@@ -34,7 +34,7 @@ def test_result_and_gradient_are_those_of_the_problem_itself(data, x64):
     data = data.astype(jnp.float64)
 
     def value(data):
-        return solve_graduated(FunctionProblem(spread, data, Tukey(5.0)), jnp.array(20.0)).value
+        return solve_graduated(FunctionProblem(deviations, data, Tukey(5.0)), jnp.array(20.0)).value
 
     gradient = jax.jit(jax.grad(value))(data)
     for i in (0, 7, 35):
@@ -43,5 +43,5 @@ def test_result_and_gradient_are_those_of_the_problem_itself(data, x64):
 
 
 def test_plain_least_squares_is_left_as_it_is(data):
-    problem = FunctionProblem(spread, data, Quadratic())
+    problem = FunctionProblem(deviations, data, Quadratic())
     assert float(solve_graduated(problem, jnp.array(5.0)).value) == pytest.approx(float(jnp.mean(data)), rel=1e-5)

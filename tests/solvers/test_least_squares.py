@@ -36,13 +36,13 @@ def noisy_alignment(rng, dtype=np.float64, outliers=0.0):
     return {name: jnp.asarray(value, dtype) for name, value in arrays.items()}
 
 
-def near_start(dtype=np.float64):
+def near_truth(dtype=np.float64):
     return SE3.exp(jnp.asarray(TRUTH + 0.05, dtype))
 
 
 @eqx.filter_jit
-def fit_points(data, loss, start, solver=GaussNewton()):
-    return solve(FunctionProblem(alignment, data, loss), start, solver=solver)
+def fit_points(data, loss, initial, solver=GaussNewton()):
+    return solve(FunctionProblem(alignment, data, loss), initial, solver=solver)
 
 
 def kabsch(source, target):
@@ -84,9 +84,9 @@ def with_prior(state, data):
 def test_solvers_agree_on_a_pytree_with_two_kernels(name, x64, rng):
     data = noisy_alignment(rng, outliers=0.2)
     problem = FunctionProblem(with_prior, data, {"points": Cauchy(2.0), "prior": Quadratic()})
-    start = {"bias": jnp.zeros(3), "frame": jnp.array(7), "pose": near_start()}
-    reference = solve(problem, start)
-    found = solve(problem, start, solver=SOLVERS[name])
+    initial = {"bias": jnp.zeros(3), "frame": jnp.array(7), "pose": near_truth()}
+    reference = solve(problem, initial)
+    found = solve(problem, initial, solver=SOLVERS[name])
     assert bool(reference.ok) and bool(found.ok) and int(found.value["frame"]) == 7
     assert np.abs(local(reference.value, found.value)).max() < 1e-8
     np.testing.assert_allclose(found.covariance, reference.covariance, atol=1e-9)
@@ -102,7 +102,7 @@ def moved(data, direction, step):
 
 def summary(data, loss):
     """A scalar of the solution that all of the pose enters."""
-    value = fit_points(data, loss, near_start(data["target"].dtype)).value
+    value = fit_points(data, loss, near_truth(data["target"].dtype)).value
     weights = jnp.sin(jnp.arange(6.0, dtype=data["target"].dtype))
     return jnp.sum(weights * value.log())
 
@@ -128,7 +128,7 @@ def inner(a, b):
 def test_gradient_equals_differences(name, x64, rng):
     data, loss = noisy_alignment(rng, outliers=0.3), LOSSES[name]()
     direction = directions(data, rng)
-    found = fit_points(data, loss, near_start())
+    found = fit_points(data, loss, near_truth())
     assert bool(found.ok) and int(found.num_steps) <= 12
     _, forward, gradient = first_derivatives(data, direction, loss)
     np.testing.assert_allclose(inner(gradient, direction), forward, rtol=1e-11)
@@ -168,7 +168,7 @@ def test_second_derivative_equals_differences_of_the_first(x64, rng):
 def test_covariance_is_differentiable(x64, rng):
     data = noisy_alignment(rng, outliers=0.3)
     direction = directions(data, rng)
-    size = eqx.filter_jit(lambda d: jnp.trace(fit_points(d, LOSSES["cauchy"](), near_start()).covariance))
+    size = eqx.filter_jit(lambda d: jnp.trace(fit_points(d, LOSSES["cauchy"](), near_truth()).covariance))
     _, slope = jax.jvp(size, (data,), (direction,))
     step = 1e-5
     difference = (size(moved(data, direction, step)) - size(moved(data, direction, -step))) / (2 * step)
@@ -191,14 +191,14 @@ def test_masked_equals_absent(x64, rng):
     data = noisy_alignment(rng)
     masked = {**data, "mask": data["mask"].at[20:].set(0.0)}
     absent = {**data, **{name: data[name][:20] for name in ("mask", "source", "target")}}
-    a, b = (fit_points(d, LOSSES["cauchy"](), near_start()) for d in (masked, absent))
+    a, b = (fit_points(d, LOSSES["cauchy"](), near_truth()) for d in (masked, absent))
     np.testing.assert_allclose(a.value.matrix(), b.value.matrix(), atol=1e-12)
     np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-8, atol=1e-15)
 
 
-def test_start_has_no_derivative(x64, rng):
+def test_initial_value_has_no_derivative(x64, rng):
     data = noisy_alignment(rng)
-    slope = jax.jacfwd(lambda d: fit_points(data, Quadratic(), near_start().retract(d)).value.matrix())(jnp.zeros(6))
+    slope = jax.jacfwd(lambda d: fit_points(data, Quadratic(), near_truth().retract(d)).value.matrix())(jnp.zeros(6))
     assert not np.any(slope)
 
 
@@ -210,14 +210,14 @@ def test_two_points_leave_a_turn_about_their_line(solver):
     dtype = np.float32
     points = jnp.asarray(TWO_POINTS, dtype)
     data = {"mask": jnp.ones(2, dtype), "sigma": jnp.asarray(0.1, dtype), "source": points, "target": points}
-    start = SE3.exp(jnp.asarray([0.1, 0.0, -0.1, 0.0, 0.1, 0.05], dtype))
-    found = fit_points(data, Quadratic(), start, solver)
+    initial = SE3.exp(jnp.asarray([0.1, 0.0, -0.1, 0.0, 0.1, 0.05], dtype))
+    found = fit_points(data, Quadratic(), initial, solver)
     assert not bool(found.ok) and int(found.status) == Status.RANK_DEFICIENT
     assert np.all(np.isfinite(found.covariance)) and np.abs(found.value.apply(points) - points).max() < 1e-5
     assert int(found.observability().rank) == 5
     message = found.describe()
     assert "1.00 rotation_x" in message and "rotation_y" not in message
-    gradient = jax.jit(jax.grad(lambda d: fit_points(d, Quadratic(), start, solver).value.translation[0]))(data)
+    gradient = jax.jit(jax.grad(lambda d: fit_points(d, Quadratic(), initial, solver).value.translation[0]))(data)
     assert all(not np.any(leaf) for leaf in jax.tree.leaves(gradient))
 
 
@@ -231,22 +231,22 @@ def counted(pose, data):
 
 def test_new_numbers_compile_nothing(rng):
     data = noisy_alignment(rng, np.float32)
-    solve(FunctionProblem(counted, data, Cauchy(2.0)), near_start(np.float32))
+    solve(FunctionProblem(counted, data, Cauchy(2.0)), near_truth(np.float32))
     count = len(TRACES)
     for scale in (1.5, 3.0):
         data = jax.tree.map(lambda x: 1.01 * x, data)
-        solve(FunctionProblem(counted, data, Cauchy(scale)), near_start(np.float32))
+        solve(FunctionProblem(counted, data, Cauchy(scale)), near_truth(np.float32))
     assert count > 0 and len(TRACES) == count
 
 
-@pytest.mark.parametrize("place", ["target", "sigma", "start"])
+@pytest.mark.parametrize("place", ["target", "sigma", "initial"])
 def test_numbers_that_are_not_finite(place, rng):
     dtype = np.float32
-    data, start = noisy_alignment(rng, dtype), near_start(dtype)
+    data, initial = noisy_alignment(rng, dtype), near_truth(dtype)
 
     @jax.jit
     def everything(data):
-        found = fit_points(data, Quadratic(), start)
+        found = fit_points(data, Quadratic(), initial)
         return jnp.sum(found.value.matrix()) + jnp.trace(found.covariance) + found.cost + jnp.sum(found.information)
 
     if place == "target":
@@ -254,8 +254,8 @@ def test_numbers_that_are_not_finite(place, rng):
     elif place == "sigma":
         data["sigma"] = jnp.asarray(0.0, dtype)
     else:
-        start = SE3.exp(jnp.full(6, jnp.nan, dtype))
-    found = fit_points(data, Quadratic(), start)
+        initial = SE3.exp(jnp.full(6, jnp.nan, dtype))
+    found = fit_points(data, Quadratic(), initial)
     assert not bool(found.ok) and int(found.status) == Status.NONFINITE and "nan" in found.describe()
     for leaf in (found.value.matrix(), found.covariance, found.cost, found.information):
         assert np.all(np.isfinite(leaf))
@@ -271,7 +271,7 @@ def test_degenerate_lanes_leave_the_others_alone(x64, rng):
     batch = jax.tree.map(lambda *x: jnp.stack(x), good, line, empty, bad)
 
     def lane(data):
-        found = fit_points(data, LOSSES["cauchy"](), near_start())
+        found = fit_points(data, LOSSES["cauchy"](), near_truth())
         return jnp.sum(found.value.log()) + jnp.trace(found.covariance), found.ok
 
     (values, ok), gradients = jax.jit(jax.vmap(jax.value_and_grad(lane, has_aux=True)))(batch)
@@ -292,7 +292,7 @@ def arctangent(x, data):
     return jnp.arctan(x - data)
 
 
-def test_far_starts_need_damping(x64):
+def test_far_initial_values_need_damping(x64):
     """Newton's classic: full steps on an arctangent run away from starts beyond 1.39."""
     problem = FunctionProblem(arctangent, jnp.array([0.5]))
     assert not bool(solve(problem, jnp.array([4.5])).ok)

@@ -154,7 +154,7 @@ def test_degenerate_sets_are_flagged_and_finite(align, rng):
         assert np.all(np.isfinite(gradient)) and not np.any(gradient[:5]) and np.any(gradient[5])
 
 
-def test_masked_equals_absent_and_nan_stops_at_the_door(x64, rng):
+def test_masked_equals_absent_and_nan_is_masked(x64, rng):
     source, target = cloud(rng)
     spoiled = target.copy()
     spoiled[6:] = np.nan

@@ -72,14 +72,14 @@ def test_normal_equations_equal_numpy(setting):
     gradient = jax.jit(jax.grad(lambda d: cost_along(problem, state, d)))(jnp.zeros(9))
     np.testing.assert_allclose(normal.gradient, gradient, atol=1e-10)
     np.testing.assert_allclose(normal.cost, cost(problem, state), rtol=1e-12)
-    assert np.linalg.eigvalsh(normal.hessian + normal.bend).min() > 0
+    assert np.linalg.eigvalsh(normal.hessian + normal.correction).min() > 0
 
 
 def test_bend_completes_the_curvature_of_gentle_residuals(x64):
     """For residuals linear in the state and all well inside the kernel, nothing but the bend is missing."""
     problem = FunctionProblem(lambda x, data: (data - x[0])[None, :], jnp.array([-0.3, 0.1, 0.4]), Cauchy(2.0))
     normal = normal_equations(problem, jnp.array([0.0]))
-    np.testing.assert_allclose(normal.hessian + normal.bend, problem.hessian(jnp.array([0.0])), rtol=1e-12)
+    np.testing.assert_allclose(normal.hessian + normal.correction, problem.hessian(jnp.array([0.0])), rtol=1e-12)
 
 
 def test_sandwich_of_a_mean(x64, rng):
@@ -122,4 +122,4 @@ def test_empty_residual_is_refused():
 def test_dtype_is_kept(dtype, rng):
     state, data = state_and_data(rng, dtype)
     normal = jax.jit(normal_equations)(FunctionProblem(residual, data), state)
-    assert normal.cost.dtype == normal.gradient.dtype == normal.hessian.dtype == dtype and normal.bend is None
+    assert normal.cost.dtype == normal.gradient.dtype == normal.hessian.dtype == dtype and normal.correction is None

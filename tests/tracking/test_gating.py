@@ -57,18 +57,18 @@ def test_pairs_are_scipys(scene, dtype):
     assert not bool(jnp.any(found.inside[:, 2])) and bool(jnp.all(found.log_likelihood[:, 2] == -jnp.inf))
 
 
-def test_measurements_with_bad_numbers_count_as_absent():
+def test_measurements_with_nonfinite_values_count_as_absent():
     z = (jnp.array([[0.0, 1.0], [jnp.nan, 0.0], [2.0, jnp.inf]]), jnp.array([1.0, 2.0, 3.0]), jnp.array([1, 2, 3]))
-    assert gating.count_valid(z, jnp.array([True, True, True])).tolist() == [True, False, False]
-    assert gating.count_valid(z, jnp.array([False, True, True])).tolist() == [False, False, False]
-    assert gating.count_valid(jnp.zeros((0, 2)), jnp.zeros(0, bool)).shape == (0,)
+    assert gating.usable_measurements(z, jnp.array([True, True, True])).tolist() == [True, False, False]
+    assert gating.usable_measurements(z, jnp.array([False, True, True])).tolist() == [False, False, False]
+    assert gating.usable_measurements(jnp.zeros((0, 2)), jnp.zeros(0, bool)).shape == (0,)
 
 
 def test_there_is_room_for_one_at_least():
-    z, valid = gating.with_room((jnp.zeros((0, 2)), jnp.zeros((0,), jnp.int32)), jnp.zeros(0, bool))
+    z, valid = gating.at_least_one((jnp.zeros((0, 2)), jnp.zeros((0,), jnp.int32)), jnp.zeros(0, bool))
     assert z[0].shape == (1, 2) and z[1].dtype == jnp.int32 and valid.tolist() == [False]
     given = jnp.ones((2, 2)), jnp.array([True, False])
-    assert gating.with_room(*given)[0] is given[0]
+    assert gating.at_least_one(*given)[0] is given[0]
 
 
 def test_bearings_wrap():

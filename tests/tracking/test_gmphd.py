@@ -1,16 +1,12 @@
-"""The GM-PHD filter against Stone Soup, a plain NumPy one, and what its equations say."""  # T-45, T-63, T-75
-
-import datetime
+"""The GM-PHD filter as a tracker: padding, capacity, labels, clutter rate, gradients, a published scenario."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
 import jaxloc as jl
-from jaxloc.tracking import gmphd
 
 F = np.eye(4) + np.eye(4, k=2)
 H = np.eye(2, 4)
@@ -49,146 +45,6 @@ def make_phd(
     return jl.tracking.GmPhd(model, capacity=capacity, **options)
 
 
-def random_mixtures(rng, count, size):
-    """Weights, means, and covariances between which nothing is alike."""
-    roots = rng.normal(size=(count, size, 4, 4))
-    covariances = roots @ roots.swapaxes(-1, -2) + 0.5 * np.eye(4)
-    return rng.uniform(0.05, 1.2, size=(count, size)), rng.normal(scale=6.0, size=(count, size, 4)), covariances
-
-
-def numpy_update(weights, means, covariances, measurements, detection, clutter, born=0.0):
-    """Missed components, then those of each measurement; clutter and births as intensities.
-
-    References: Vo and Ma 2006, eqs. 28-34.
-    """
-    parts = [((1 - detection) * w, m, P) for w, m, P in zip(weights, means, covariances, strict=True)]
-    log_likelihood = -detection * np.sum(weights)
-    for z in measurements:
-        explained = []
-        for w, m, P in zip(weights, means, covariances, strict=True):
-            S = H @ P @ H.T + np.eye(2)
-            K = P @ H.T @ np.linalg.inv(S)
-            joseph = (np.eye(4) - K @ H) @ P @ (np.eye(4) - K @ H).T + K @ K.T
-            density = multivariate_normal.pdf(z, H @ m, S)
-            explained.append((detection * w * density, m + K @ (z - H @ m), joseph))
-        total = clutter + born + sum(part[0] for part in explained)
-        log_likelihood += np.log(total)
-        parts += [(w / total, m, P) for w, m, P in explained]
-    return parts, log_likelihood
-
-
-def assert_same(mixture, parts, tolerance):
-    """As sets: in the order of their weights."""
-    parts = sorted(parts, key=lambda part: -part[0])
-    weights = np.asarray(mixture.weights)
-    assert len(parts) == len(weights)
-    np.testing.assert_allclose(weights, [part[0] for part in parts], rtol=0, atol=tolerance)
-    for k, (w, m, P) in enumerate(parts):
-        if w > 1e-12:
-            np.testing.assert_allclose(mixture.means[k], m, rtol=0, atol=tolerance)
-            np.testing.assert_allclose(mixture.covariances[k], P, rtol=0, atol=tolerance)
-
-
-@eqx.filter_jit
-@eqx.filter_vmap(in_axes=(eqx.if_array(0), eqx.if_array(0), 0, None))
-def step_many(phd, mixture, measurements, valid):
-    return gmphd.update(gmphd.predict(mixture, phd), measurements, valid, phd)
-
-
-@pytest.fixture(scope="module")
-def hundred():
-    """A hundred random mixtures, each with its own probabilities, in float64, predicted and updated."""
-    rng = np.random.default_rng(1)
-    weights, means, covariances = random_mixtures(rng, 100, 4)
-    measurements = rng.normal(scale=6.0, size=(100, 4, 2))
-    detection, survival, rate = rng.uniform(0.5, 0.99, 100), rng.uniform(0.8, 0.99, 100), rng.uniform(1.0, 30.0, 100)
-    with jax.enable_x64(True):
-        phds = eqx.filter_vmap(lambda d, s, r: make_phd(detection=d, survival=s, rate=r, dtype=jnp.float64))(
-            *map(jnp.asarray, (detection, survival, rate))
-        )
-        mixtures = jl.beliefs.Mixture(*map(jnp.asarray, (weights, means, covariances)), jnp.zeros((100, 4), jnp.int32))
-        after, evidence = step_many(phds, mixtures, jnp.asarray(measurements), jnp.ones(4, bool))
-        after, evidence = jax.tree.map(np.asarray, (after, evidence))
-    return (weights, means, covariances, measurements, detection, survival, rate), after, evidence
-
-
-def test_hundred_mixtures_are_stone_soups(hundred):  # T-63
-    pytest.importorskip("stonesoup")
-    from stonesoup.hypothesiser.distance import DistanceHypothesiser
-    from stonesoup.hypothesiser.gaussianmixture import GaussianMixtureHypothesiser
-    from stonesoup.measures import Mahalanobis
-    from stonesoup.models.measurement.linear import LinearGaussian
-    from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
-    from stonesoup.predictor.kalman import KalmanPredictor
-    from stonesoup.types.detection import Detection
-    from stonesoup.types.state import TaggedWeightedGaussianState
-    from stonesoup.updater.kalman import KalmanUpdater
-    from stonesoup.updater.pointprocess import PHDUpdater
-
-    then, now = datetime.datetime(2024, 1, 1), datetime.datetime(2024, 1, 1, 0, 0, 1)
-    predictor = KalmanPredictor(CombinedLinearGaussianTransitionModel([ConstantVelocity(0.5)] * 2))
-    sensor = LinearGaussian(4, (0, 2), np.eye(2))
-    kalman = KalmanUpdater(sensor)
-    # All pairs (it gates otherwise), and births like other components: it gives those with the tag no missed term.
-    single = DistanceHypothesiser(predictor, kalman, Mahalanobis(), missed_distance=1e9, include_all=True)
-    hypothesiser = GaussianMixtureHypothesiser(single, order_by_detection=True)
-    swap = np.array([0, 2, 1, 3])  # its states are (x, vx, y, vy)
-    birth = static_birth().intensity
-
-    def component(weight, mean, covariance, time):
-        return TaggedWeightedGaussianState(
-            mean[swap].reshape(-1, 1), covariance[np.ix_(swap, swap)], timestamp=time, weight=weight, tag="one"
-        )
-
-    data, after, _ = hundred
-    for number, (w, m, P, z, detection, survival, rate) in enumerate(zip(*data, strict=True)):
-        components = []
-        for k in range(4):
-            predicted = predictor.predict(component(w[k], m[k], P[k], then), timestamp=now)
-            mean = np.asarray(predicted.mean, float).ravel()
-            components.append(component(w[k], mean[swap], np.asarray(predicted.covar)[np.ix_(swap, swap)], now))
-        for mean in np.asarray(birth.means, float):  # its updater multiplies every weight by the survival
-            components.append(component(0.1 / survival, mean, 10.0 * np.eye(4), now))
-        updater = PHDUpdater(
-            kalman, clutter_spatial_density=rate / 1e4, prob_detection=detection, prob_survival=survival
-        )
-        detections = [Detection(row.reshape(-1, 1), timestamp=now, measurement_model=sensor) for row in z]
-        found = updater.update(hypothesiser.hypothesise(components, detections, now))
-        parts = [
-            (float(c.weight), np.asarray(c.mean, float).ravel()[swap], np.asarray(c.covar, float)[np.ix_(swap, swap)])
-            for c in found.components
-        ]
-        assert_same(jax.tree.map(lambda leaf, n=number: leaf[n], after), parts, 1e-9)
-
-
-def test_hundred_mixtures_are_numpys(hundred):  # T-75
-    data, after, evidence = hundred
-    birth = static_birth().intensity
-    for number, (w, m, P, z, detection, survival, rate) in enumerate(zip(*data, strict=True)):
-        weights = np.concatenate([survival * w, [0.1, 0.1]])
-        means = np.concatenate([m @ F.T, np.asarray(birth.means, float)])
-        covariances = np.concatenate([F @ P @ F.T + cv_noise(0.5), [10.0 * np.eye(4)] * 2])
-        parts, log_likelihood = numpy_update(weights, means, covariances, z, detection, rate / 1e4)
-        assert_same(jax.tree.map(lambda leaf, n=number: leaf[n], after), parts, 1e-9)
-        assert float(evidence.log_likelihood[number]) == pytest.approx(log_likelihood - rate, abs=1e-9)
-        explained = np.sum([part[0] for part in parts[6:]])
-        assert float(np.sum(evidence.clutter[number])) == pytest.approx(4 - explained, abs=1e-9)
-
-
-@pytest.mark.usefixtures("x64")
-def test_spawning_is_a_motion_of_each_component(rng):
-    w, m, P = (part[0] for part in random_mixtures(rng, 1, 3))
-    back = jl.filters.LinearMotion(-jnp.eye(4), jnp.diag(jnp.array([1.0, 2.0, 3.0, 4.0])))
-    spawning = jl.tracking.Spawning(jnp.asarray(0.05), back)
-    phd = make_phd(dtype=jnp.float64, spawning=spawning)
-    mixture = jl.beliefs.Mixture(*map(jnp.asarray, (w, m, P)), jnp.array([4, 7, 2], jnp.int32))
-    found = gmphd.predict(mixture, phd)
-    np.testing.assert_allclose(found.weights, [*(0.95 * w), *(0.05 * w), 0.1, 0.1], atol=1e-12)
-    np.testing.assert_allclose(found.means[3:6], -m, atol=1e-12)
-    np.testing.assert_allclose(found.covariances[3:6], P + np.diag([1.0, 2.0, 3.0, 4.0]), atol=1e-9)
-    assert found.labels.tolist() == [4, 7, 2, 8, 9, 10, 11, 12]
-
-
 @eqx.filter_jit
 def step(phd, state, measurements, valid):
     return phd.update(phd.predict(state, None), measurements, valid)
@@ -217,7 +73,7 @@ def test_other_filters_equal_the_linear_one_on_linear_models(kind):
     assert_trees_close(*found, 1e-8)
 
 
-def test_bad_numbers_and_padding_are_absent():
+def test_nonfinite_values_and_padding_are_absent():
     phd = make_phd()
     state, z = some_state(phd), jnp.asarray(SEEN, jnp.float32)
     masked = step(phd, state, z, jnp.array([True, True, False, False]))
@@ -263,39 +119,16 @@ def test_too_large_a_prior_is_an_error():
         phd.init(jl.beliefs.Mixture.empty(5, jnp.zeros(4)))
 
 
-@pytest.mark.parametrize("gate", [None, 0.99])
-def test_births_with_measurements_have_exact_weights(gate):
-    birth = jl.tracking.PointBirth(0.2, 1e4, jnp.eye(2), jnp.full(2, 9.0))
-    phd = make_phd(birth=birth, gate=gate, prune=0.0, closeness=jl.beliefs.MahalanobisDistance(0.0), capacity=40)
-    mixture = some_state(phd).mixture.take(jnp.arange(3))
-    z = jnp.asarray(SEEN, jnp.float32)
-    predicted = gmphd.predict(mixture, phd)
-    found, evidence = gmphd.update(predicted, z, jnp.ones(4, bool), phd, first_label=50)
-    parts, log_likelihood = numpy_update(
-        *(np.asarray(leaf, float) for leaf in (predicted.weights, predicted.means, predicted.covariances)),
-        SEEN, 0.9, 4e-4, 0.2e-4,
-    )  # fmt: skip
-    explained = np.array([sum(part[0] for part in parts[3 + 3 * j : 6 + 3 * j]) for j in range(4)])
-    expected = (1.0 - explained) * 0.2 / 4.2
-    if gate is None:
-        assert float(evidence.log_likelihood) == pytest.approx(log_likelihood - 4.2, abs=1e-3)
-    else:  # those that a target may explain bear none
-        expected[:2] = 0.0
-    np.testing.assert_allclose(evidence.born, expected, rtol=2e-3, atol=1e-7)
-    for j in np.flatnonzero(expected > 1e-3):
-        slot = found.labels.tolist().index(50 + j)
-        np.testing.assert_allclose(found.means[slot], [*SEEN[j], 0.0, 0.0], atol=1e-6)
-        np.testing.assert_allclose(found.covariances[slot], np.diag([1.0, 1.0, 9.0, 9.0]), atol=1e-6)
-
-
 def test_extraction_copies_heavy_components():  # T-82
     means = jnp.arange(20.0).reshape(5, 4)
     covariances = jnp.stack([jnp.eye(4)] * 5)
     labels = jnp.arange(5, dtype=jnp.int32)
     mixture = jl.beliefs.Mixture(jnp.array([2.3, 0.4, 0.51, 0.0, 1.0]), means, covariances, labels)
-    found = gmphd.extract(mixture)
+    phd = make_phd(capacity=5, copies=True)
+    found = phd.extract(phd.init(mixture))
     assert found.labels[found.valid].tolist() == [0, 0, 2, 4]
-    once = gmphd.extract(mixture, copies=False)
+    phd = make_phd(capacity=5)
+    once = phd.extract(phd.init(mixture))
     assert once.labels[once.valid].tolist() == [0, 2, 4]
     np.testing.assert_allclose(once.means[once.valid], np.asarray(means)[[0, 2, 4]])
 
@@ -347,9 +180,6 @@ def test_labels_stay_with_their_targets(tracked):  # T-82
 
 def test_run_is_its_steps(tracked):
     _, phd, args, _, history = tracked
-    last, copied = gmphd.run(jl.beliefs.Mixture.empty(1, jnp.zeros(4)), phd, *args[1:], copies=False)
-    np.testing.assert_array_equal(copied.states.means, history.states[0].means)
-    np.testing.assert_array_equal(last.weights, history.states[1].weights[-1])
     state = args[0]
     for t in range(4):
         state, info = step(phd, state, args[2][t], args[3][t])
@@ -426,12 +256,12 @@ def test_published_scenario():  # T-74
             jl.beliefs.Mixture(scenario.birth_weights, scenario.birth_means, jnp.stack([scenario.birth_covariance] * 4))
         ),
     )
-    phd = jl.tracking.GmPhd(model, capacity=60, gate=0.999)
+    phd = jl.tracking.GmPhd(model, capacity=60, gate=0.999, copies=True)
 
     def one(key):
         drive = jl.data.simulate.targets.simulate_targets(scenario, key=key)
         prior = jl.beliefs.Mixture.empty(1, jnp.zeros(4))
-        _, history = gmphd.run(prior, phd, None, drive.measurements, drive.valid)
+        _, history = jl.filters.run(phd, phd.init(prior), None, drive.measurements, drive.valid, keep=phd.extract)
         found = history.states
         distance = jax.vmap(lambda x, v, y, w: jl.evaluation.targets.ospa(x, v, y, w, cutoff=100.0).distance)
         return jnp.mean(distance(found.means[..., :2], found.valid, drive.truth[..., :2], drive.truth_valid))

@@ -32,7 +32,7 @@ def update(tracker, state, z, valid):
     return tracker.update(state, z, valid)
 
 
-def nobody():
+def no_targets():
     return jl.beliefs.Mixture.empty(1, jnp.zeros(4))
 
 
@@ -56,7 +56,7 @@ def trackers():
     model = make_model()
     return {
         "gnn": jl.tracking.GlobalNearestNeighbor(model, capacity=16),
-        "gnn counts": jl.tracking.GlobalNearestNeighbor(model, capacity=16, life=jl.tracking.CountLife(3, 5, 3)),
+        "gnn counts": jl.tracking.GlobalNearestNeighbor(model, capacity=16, logic=jl.tracking.HistoryLogic(3, 5, 3)),
         "pda": jl.tracking.ProbabilisticDataAssociation(model, capacity=16),
         "jpda": jl.tracking.JointProbabilisticDataAssociation(model, capacity=16),
         "jpda exact": jl.tracking.JointProbabilisticDataAssociation(model, capacity=16, marginals=jl.tracking.Exact()),
@@ -69,7 +69,7 @@ def trackers():
 def test_all_trackers_through_one_driver(name, scene):  # T-65
     truth, measurements, valid = scene
     tracker = trackers()[name]
-    state, history = run(tracker, tracker.init(nobody()), jnp.ones(40), measurements, valid, keep=tracker.extract)
+    state, history = run(tracker, tracker.init(no_targets()), jnp.ones(40), measurements, valid, keep=tracker.extract)
     assert bool(jnp.all(history.infos.ok)) and bool(jnp.all(jnp.isfinite(history.infos.log_likelihood)))
     assert name in ("pda", "mht", "phd") or int(jnp.max(history.infos.crowded)) == 0
     found, there = history.states, jnp.ones(2, bool)
@@ -116,15 +116,15 @@ def test_one_scan_is_scipys_assignment(rng):
 
 
 def test_modes_inside_tracks():  # T-6
-    calm, wild = make_filter(0.001), make_filter(10.0)
-    modes = jl.filters.InteractingFilters((calm, wild), jnp.array([[0.95, 0.05], [0.1, 0.9]]))
+    steady, agile = make_filter(0.001), make_filter(10.0)
+    modes = jl.filters.InteractingFilters((steady, agile), jnp.array([[0.95, 0.05], [0.1, 0.9]]))
     tracker = jl.tracking.GlobalNearestNeighbor(make_model(modes), capacity=8)
     times = np.arange(24.0)
     turn = np.where(times < 12, 0.0, times - 12)
     path = np.stack([2 * times, 6 * turn], axis=1)
     places = jnp.asarray(np.stack([path, -path - 20.0], axis=1), jnp.float32)
     state, history = run(
-        tracker, tracker.init(nobody()), jnp.ones(24), places, jnp.ones((24, 2), bool), keep=lambda s: s
+        tracker, tracker.init(no_targets()), jnp.ones(24), places, jnp.ones((24, 2), bool), keep=lambda s: s
     )
     found = tracker.extract(state)
     assert found.labels[found.valid].tolist() == [0, 1]
@@ -142,7 +142,7 @@ def test_modes_inside_tracks():  # T-6
         jl.tracking.ProbabilisticDataAssociation(make_model(modes))
 
 
-def test_nothing_measured_and_bad_numbers():
+def test_nothing_measured_and_nonfinite_values():
     tracker = jl.tracking.GlobalNearestNeighbor(make_model(), capacity=4)
     prior = jl.beliefs.Mixture(jnp.array([0.99, 0.5]), jnp.zeros((2, 4)), jnp.stack([jnp.eye(4)] * 2))
     state = tracker.init(prior)
@@ -159,14 +159,14 @@ def test_nothing_measured_and_bad_numbers():
 def test_full_table_says_so(rng):
     tracker = jl.tracking.GlobalNearestNeighbor(make_model(), capacity=2)
     z = jnp.asarray(rng.uniform(-50, 50, size=(8, 2)), jnp.float32)
-    state, info = update(tracker, tracker.init(nobody()), z, jnp.ones(8, bool))
+    state, info = update(tracker, tracker.init(no_targets()), z, jnp.ones(8, bool))
     assert int(info.crowded) == 6 and int(jnp.sum(state.valid)) == 2
 
 
 def test_batches_are_loops(scene):
     _, measurements, valid = scene
     tracker = jl.tracking.GlobalNearestNeighbor(make_model(), capacity=16)
-    start = tracker.init(nobody())
+    start = tracker.init(no_targets())
 
     def likelihood(z, v):
         return run(tracker, start, jnp.ones(10), z, v)[1].infos.log_likelihood

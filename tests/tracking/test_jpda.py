@@ -111,7 +111,7 @@ def test_update_is_stone_soups(x64):
     detection, density = 0.9, 0.125
     now = datetime.datetime(2020, 1, 1)
     means = np.array([[0.0, 0.0, 1.0, 0.0], [2.0, 0.5, 0.0, 1.0], [1.0, -1.5, 0.5, 0.5]])
-    spread = np.diag([1.5, 1.0, 0.3, 0.3])
+    covariance = np.diag([1.5, 1.0, 0.3, 0.3])
     z = np.array([[0.4, 0.2], [1.6, 0.1], [1.1, -1.0]])
 
     order = [0, 2, 1, 3]  # Stone Soup's states are (x, vx, y, vy)
@@ -119,12 +119,12 @@ def test_update_is_stone_soups(x64):
     sensor = LinearGaussian(4, (0, 2), 0.75 * np.eye(2))
     updater = KalmanUpdater(sensor)
     theirs = PDAHypothesiser(KalmanPredictor(still), updater, density, detection, prob_gate=1.0, include_all=True)
-    tracks = [Track([GaussianState(m[order], spread[np.ix_(order, order)], now)]) for m in means]
+    tracks = [Track([GaussianState(m[order], covariance[np.ix_(order, order)], now)]) for m in means]
     detections = [Detection(StateVector(point), timestamp=now, measurement_model=sensor) for point in z]
     found = JPDA(theirs).associate(tracks, detections, now)
 
     tracker = make_tracker(detection, density)
-    prior = jl.beliefs.Mixture(jnp.ones(3), jnp.asarray(means), jnp.stack([jnp.asarray(spread)] * 3))
+    prior = jl.beliefs.Mixture(jnp.ones(3), jnp.asarray(means), jnp.stack([jnp.asarray(covariance)] * 3))
     after, _ = eqx.filter_jit(tracker.update)(tracker.init(prior), jnp.asarray(z), jnp.ones(3, bool))
     density_after = after.densities()
     back = np.argsort(order)

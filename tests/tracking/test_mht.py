@@ -35,7 +35,7 @@ def update(tracker, state, z, valid):
     return tracker.update(state, z, valid)
 
 
-def nobody():
+def no_targets():
     return jl.beliefs.Mixture.empty(1, jnp.zeros(4))
 
 
@@ -51,7 +51,7 @@ def test_search_is_enumeration(rng):
     missed = jnp.asarray(np.log(rng.uniform(size=40)), jnp.float32)
     members = jnp.array([[0, 1, -1, 2, -1, -1], [3, -1, -1, -1, -1, -1]], jnp.int32)
     weights = jnp.log(jnp.array([0.7, 0.3]))
-    seen = eqx.filter_jit(likelihood_ratio.examine)(
+    seen = eqx.filter_jit(likelihood_ratio.compare_scan)(
         tracker.model, state.leaves, jnp.zeros((3, 2)), jnp.ones(3, bool), None
     )
     seen = eqx.tree_at(lambda s: (s.log_odds, s.log_missed), seen, (odds, missed))
@@ -108,18 +108,18 @@ def test_identities_through_a_crossing():
 def test_answers_are_of_one_hypothesis(rng):
     tracker = make_tracker()
     z = jnp.asarray(rng.uniform(-3, 3, size=(12, 5, 2)), jnp.float32)
-    state, history = run(tracker, tracker.init(nobody()), jnp.ones(12), z, jnp.ones((12, 5), bool))
+    state, history = run(tracker, tracker.init(no_targets()), jnp.ones(12), z, jnp.ones((12, 5), bool))
     assert bool(jnp.all(history.infos.ok))
     for t in range(12):
         at = jax.tree.map(lambda leaf, t=t: leaf[t], history.states)
         weights = np.exp(at.log_weights)
         assert weights.sum() == pytest.approx(1.0, rel=1e-4)
         member = np.asarray(at.membership())
-        alive = weights > 0
-        assert len({row.tobytes() for row in member[alive]}) == alive.sum()
+        present = weights > 0
+        assert len({row.tobytes() for row in member[present]}) == present.sum()
         labels, paths = np.asarray(at.leaves.labels), np.asarray(at.paths)
         final = {}
-        for row in member[alive]:
+        for row in member[present]:
             # One leaf of a tree, and no measurement twice.
             assert len(set(labels[row])) == row.sum() and np.all(labels[row] >= 0)
             taken = paths[row, 0][paths[row, 0] >= 0]
@@ -131,7 +131,7 @@ def test_answers_are_of_one_hypothesis(rng):
 
 def test_nothing_measured_and_full_tables(rng):
     tracker = make_tracker(leaves=4, tracks=3)
-    state = tracker.init(nobody())
+    state = tracker.init(no_targets())
     empty, info = update(tracker, state, jnp.full((5, 2), jnp.nan), jnp.ones(5, bool))
     assert bool(info.ok) and float(info.count) == 0.0 and not bool(tracker.extract(empty).valid.any())
     assert float(info.log_likelihood) == pytest.approx(-1.01, rel=1e-5)

@@ -76,11 +76,11 @@ def test_update_has_the_moments_of_the_mixture(x64):
         exists /= exists.sum()
         mean = exists @ np.array(means)
         apart = np.array(means) - mean
-        spread = np.einsum("i,ijk->jk", exists, np.array(spreads)) + np.einsum("i,ij,ik->jk", exists, apart, apart)
+        expected = np.einsum("i,ijk->jk", exists, np.array(spreads)) + np.einsum("i,ij,ik->jk", exists, apart, apart)
         slot = after.labels.tolist().index(k)
         found = after.densities()
         np.testing.assert_allclose(found.mean[slot], mean, rtol=1e-6, atol=1e-8)
-        np.testing.assert_allclose(found.covariance[slot], spread, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(found.covariance[slot], expected, rtol=1e-6, atol=1e-8)
     assert float(info.log_likelihood) == pytest.approx(likelihood, rel=1e-6)
 
 

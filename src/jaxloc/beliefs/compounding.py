@@ -1,4 +1,4 @@
-"""Uncertain poses in a chain: composing, inverting and differencing them with their covariances."""
+"""Compounding of uncertain poses: composition, inverse and relative pose, with covariances."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from jaxloc.poses.lie_group import Group
 def compose(a: Gaussian, b: Gaussian) -> Gaussian:
     """Density of ``T_a_b @ T_b_c`` for independent factors, to first order.
 
-    ``P = Ad(B^-1) P_a Ad(B^-1)^T + P_b``: right perturbations of the first factor are carried through the second.
+    ``P = Ad(B^-1) P_a Ad(B^-1)^T + P_b``: right perturbations of the first factor are transported through the second.
 
     Args:
         a: density of ``T_a_b`` (mean `SE2`, `SE3`, ...).
@@ -38,7 +38,7 @@ def compose(a: Gaussian, b: Gaussian) -> Gaussian:
         0.01
     """
     _require_pose(a, b)
-    return Gaussian(a.mean @ b.mean, _carried(b.mean.inverse(), a.covariance) + b.covariance)
+    return Gaussian(a.mean @ b.mean, _transported(b.mean.inverse(), a.covariance) + b.covariance)
 
 
 @eqx.filter_jit
@@ -64,7 +64,7 @@ def invert(a: Gaussian) -> Gaussian:
         True
     """
     _require_pose(a)
-    return Gaussian(a.mean.inverse(), _carried(a.mean, a.covariance))
+    return Gaussian(a.mean.inverse(), _transported(a.mean, a.covariance))
 
 
 @eqx.filter_jit
@@ -93,7 +93,7 @@ def relative(a: Gaussian, b: Gaussian) -> Gaussian:
     return compose(invert(a), b)
 
 
-def _carried(pose: Group, covariance: Array) -> Array:
+def _transported(pose: Group, covariance: Array) -> Array:
     adjoint = pose.adjoint()
     return matmul(matmul(adjoint, covariance), adjoint.T)
 

@@ -1,4 +1,4 @@
-"""Chi-square gates: which squared Mahalanobis distances are believable."""
+"""Chi-square distribution and gates of squared Mahalanobis distances."""
 
 from typing import Any
 
@@ -15,11 +15,11 @@ _NEWTON_STEPS = 12
 
 
 def chi2_cdf(x: Any, dof: Any) -> Float[Array, "*n"]:
-    """Probability that a chi-square variable stays below x: ``P(dof / 2, x / 2)``.
+    """Cumulative distribution function of the chi-square distribution: ``P(dof / 2, x / 2)``.
 
     Args:
         x: squared distance or an array of them.
-        dof: degrees of freedom (scalar, or as x); no gradient passes through it.
+        dof: number of degrees of freedom (scalar, or as x); no gradient passes through it.
 
     Returns:
         Probability, shaped as x.
@@ -36,14 +36,14 @@ def chi2_cdf(x: Any, dof: Any) -> Float[Array, "*n"]:
 
 
 def chi2_quantile(probability: Any, dof: Any) -> Float[Array, "*n"]:
-    """The bound that a chi-square variable stays below with the given probability.
+    """Quantile of the chi-square distribution.
 
     Newton steps on the logarithm of the smaller tail over the logarithm of x (a concave function), from the
     Wilson-Hilferty approximation; the derivative is that of the implicit function.
 
     Args:
         probability: scalar or array, clipped to [0, 1) by one unit of rounding.
-        dof: degrees of freedom (scalar, or as the probability); no gradient passes through it.
+        dof: number of degrees of freedom (scalar, or as the probability); no gradient passes through it.
 
     Returns:
         Quantile, shaped as the probability.
@@ -60,12 +60,12 @@ def chi2_quantile(probability: Any, dof: Any) -> Float[Array, "*n"]:
 
 
 def gate(mahalanobis_squared: Float[Array, "*n"], dof: Any, probability: Any) -> Bool[Array, "*n"]:
-    """Whether squared distances lie inside the region that holds the given probability.
+    """Chi-square gate: whether squared distances lie below the quantile of a probability.
 
     Args:
-        mahalanobis_squared: squared Mahalanobis distances; not-a-number lies outside.
-        dof: degrees of freedom of the residual.
-        probability: that of the gate, such as 0.99. As Python numbers, dof and probability cost nothing at run time.
+        mahalanobis_squared: squared Mahalanobis distances; NaN lies outside.
+        dof: number of degrees of freedom of the residual.
+        probability: of the gate, such as 0.99. Python numbers are evaluated at trace time.
 
     Returns:
         Booleans, shaped as the distances.
@@ -110,6 +110,6 @@ def _quantile(probability: Array, dof: Array) -> Array:
 
     tail = 2.0 * jnp.exp((jnp.log(p) + gammaln(0.5 * k + 1.0)) * 2.0 / k)
     central = k * jnp.maximum(1.0 - 2.0 / (9.0 * k) + ndtri(p) * jnp.sqrt(2.0 / (9.0 * k)), 0.0) ** 3
-    start = jnp.log(jnp.maximum(central, 0.5 * tail) + float(info.tiny))
-    x = jnp.exp(lax.fori_loop(0, _NEWTON_STEPS, improve, start))
+    initial = jnp.log(jnp.maximum(central, 0.5 * tail) + float(info.tiny))
+    x = jnp.exp(lax.fori_loop(0, _NEWTON_STEPS, improve, initial))
     return x + (probability - p) / jnp.maximum(density(x), float(info.tiny))

@@ -45,7 +45,7 @@ class Gaussian(eqx.Module):
 
     @property
     def dimension(self) -> int:
-        """Degrees of freedom of one density."""
+        """Number of degrees of freedom of one density."""
         return self.covariance.shape[-1]
 
     @eqx.filter_jit
@@ -67,13 +67,13 @@ class Gaussian(eqx.Module):
 
     @eqx.filter_jit
     def sample(self, num_samples: int, *, key: Key[Array, ""]) -> Any:
-        """Draws, stacked along a leading axis."""
+        """Random samples, stacked along a leading axis."""
         normal = jax.random.normal(key, (num_samples, self.dimension), self.covariance.dtype)
         deltas = matmul(normal, cholesky(self.covariance).T)
         return jax.vmap(lambda delta: retract(self.mean, delta))(deltas)
 
     def marginal(self, indices: tuple[int, ...]) -> "Gaussian":
-        """Density of some entries of a vector mean."""
+        """Marginal density of some entries of a vector."""
         _require_vector(self, "marginal")
         chosen = jnp.array(indices)
         return Gaussian(self.mean[chosen], self.covariance[chosen[:, None], chosen[None, :]])
@@ -81,10 +81,10 @@ class Gaussian(eqx.Module):
 
 @eqx.filter_jit
 def fuse(a: Gaussian, b: Gaussian) -> Gaussian:
-    """The normalized product of two densities of one vector: their information matrices add.
+    """Information fusion: the normalized product of two densities of one vector.
 
     Computed as ``m = m_a + K (m_b - m_a)`` with ``K = P_a (P_a + P_b)^-1`` and the Joseph form, which needs no inverse
-    of either covariance and keeps the result positive.
+    of either covariance and keeps the result positive semidefinite.
 
     Args:
         a: density with a vector mean "d".

@@ -1,4 +1,4 @@
-"""How many particles a density needs: sizes by the Kullback-Leibler distance, in fixed shapes."""
+"""KLD-sampling: adaptive number of particles by a Kullback-Leibler bound, in fixed shapes."""
 
 from typing import Any
 
@@ -16,14 +16,14 @@ _GOLDEN = 0.6180339887498949
 
 
 class KLDSize(eqx.Module):
-    """Particles enough that the distance between their density and the true one stays below a bound.
+    """Number of particles that keeps the Kullback-Leibler distance from the true density below a bound.
 
     If k bins of a grid hold particles, ``n = (k - 1) / (2 e) (1 - 2 / (9 (k - 1)) + z sqrt(2 / (9 (k - 1))))^3`` draws
     keep the Kullback-Leibler distance below ``e``, with the probability below the quantile z. Arrays keep their size:
     particles beyond the needed number are masked.
 
     Attributes:
-        bin_size: of a bin, for each coordinate (of a pose: position, then rotation vector or heading).
+        bin_size: edge of a bin in each coordinate (of a pose: position, then rotation vector or heading).
         error: bound e of the distance.
         quantile: z of the standard normal; 2.326 for 99 %.
         minimum: least number of particles.
@@ -53,10 +53,11 @@ class KLDSize(eqx.Module):
         return jnp.maximum(number.astype(jnp.int32), self.minimum)
 
     def count(self, particles: Particles) -> Int[Array, ""]:
-        """Number of draws after which there are enough, for equal particles that were drawn in ascending order.
+        """Number of samples that suffices, for equal particles sampled in ascending order.
 
-        Draws are visited in strides of the golden ratio, so that each beginning of the sequence is spread over all of
-        them; a draw counts as a new bin when it is the first in its slot of a hash table of four slots a particle.
+        Samples are visited in strides of the golden ratio, so that every prefix of the sequence is evenly distributed
+        over all of them; a sample counts as a new bin when it is the first in its slot of a hash table of four slots
+        per particle.
 
         Returns:
             At least the minimum, at most the size of the stack.
@@ -73,7 +74,7 @@ class KLDSize(eqx.Module):
 
 
 def coordinates(values: Any) -> Float[Array, "n d"]:
-    """Particles as rows of plain numbers: arrays as they are, poses as position and rotation vector (or heading).
+    """Particles as rows of coordinates: arrays as they are, poses as position and rotation vector (or heading).
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxloc as jl
@@ -94,7 +95,7 @@ def coordinates(values: Any) -> Float[Array, "n d"]:
 
 
 def _stride(size: int) -> int:
-    """A step near the golden part of the size that has no common divisor with it."""
+    """A stride near the golden ratio of the size, coprime to it."""
     step = max(int(size * _GOLDEN), 1)
     while np.gcd(step, size) != 1:
         step += 1
@@ -102,7 +103,7 @@ def _stride(size: int) -> int:
 
 
 def _hashes(values: Any, bin_size: Array) -> UInt32[Array, " n"]:
-    """A number for the bin of each particle (multiply and shift, as in MurmurHash)."""
+    """Hash of the bin of each particle (multiply and shift, as in MurmurHash)."""
     cells = jnp.floor(coordinates(values) / bin_size[None, :]).astype(jnp.int32).astype(jnp.uint32)
     mixed = jnp.zeros(cells.shape[0], jnp.uint32)
     for column in range(cells.shape[1]):

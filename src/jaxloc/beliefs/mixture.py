@@ -1,4 +1,4 @@
-"""Sums of weighted normals with room for a fixed number of them."""
+"""Gaussian mixtures with a fixed number of slots."""
 
 from typing import Any
 
@@ -21,13 +21,13 @@ _ROUNDING = 1e-5  # of a covariance, relative to its largest eigenvalue
 class Mixture(eqx.Module):
     """``D(x) = sum_i w_i N(x; m_i, P_i)``: a density when the weights sum to one, else an intensity.
 
-    Empty slots have weight zero; their means and covariances are finite numbers without a meaning.
+    Empty slots have weight zero; their means and covariances are finite and have no meaning.
 
     Args:
         weights: w, never negative; of an intensity, their sum is an expected number of objects.
         means: m, vectors, poses, or any pytree of them, stacked along a leading axis.
         covariances: P, each in the tangent space of its mean.
-        labels: whatever numbers follow the components around, such as those of tracks. Zeros when left out.
+        labels: integers that stay with the components, such as track numbers. Zeros by default.
 
     References:
         Vo and Ma, "The Gaussian mixture probability hypothesis density filter", IEEE TSP 2006 [T-45].
@@ -50,10 +50,10 @@ class Mixture(eqx.Module):
 
     @staticmethod
     def empty(capacity: int, example: Any) -> "Mixture":
-        """No components yet, with room for some.
+        """A mixture without components.
 
         Args:
-            capacity: how many there is room for.
+            capacity: number of slots.
             example: a state, for its structure.
         """
         size = tangent_dimension(example)
@@ -63,16 +63,16 @@ class Mixture(eqx.Module):
         return Mixture(jnp.zeros(capacity, dtype), means, covariances)
 
     def check(self) -> "Mixture":
-        """The mixture, if its numbers can be used; for the host, nothing is checked inside a transformation.
+        """The mixture itself, after a check on the host; nothing is checked inside a transformation.
 
         Raises:
-            ValueError: if a weight is negative, a number is not finite, or a covariance has a negative eigenvalue.
+            ValueError: if a weight is negative, a value is not finite, or a covariance has a negative eigenvalue.
         """
         leaves = [leaf for leaf in jax.tree.leaves(self) if eqx.is_inexact_array(leaf)]
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return self
         if not all(np.isfinite(leaf).all() for leaf in leaves):
-            raise ValueError("A mixture holds numbers that are not finite.")
+            raise ValueError("A mixture holds non-finite values.")
         if (np.asarray(self.weights) < 0.0).any():
             raise ValueError(f"Weights of a mixture are never negative; got {np.asarray(self.weights).min():.3g}.")
         values = np.linalg.eigvalsh(np.asarray(self.covariances, np.float64))
@@ -84,7 +84,7 @@ class Mixture(eqx.Module):
 
     @property
     def capacity(self) -> int:
-        """How many components there is room for."""
+        """Number of slots."""
         return self.weights.shape[0]
 
     @property
@@ -98,20 +98,20 @@ class Mixture(eqx.Module):
         return jnp.sum(self.weights)
 
     def take(self, indices: Int[Array, " n"]) -> "Mixture":
-        """Some of the components, by their places."""
+        """Some of the components, by index."""
         return jax.tree.map(lambda leaf: leaf[indices], self)
 
     def concatenate(self, other: "Mixture") -> "Mixture":
-        """The sum of two mixtures, one after the other."""
+        """The sum of two mixtures: the components of both."""
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), self, other)
 
     def padded(self, capacity: int) -> "Mixture":
-        """With room for more components."""
+        """The mixture with empty slots added, up to a capacity."""
         more = self.take(jnp.zeros(max(capacity - self.capacity, 0), jnp.int32))
         return self.concatenate(more.scaled(0.0))
 
     def scaled(self, factor: Any) -> "Mixture":
-        """The mixture times a number, or each component times its own."""
+        """The mixture with weights scaled by a number, or by one for each component."""
         return Mixture(self.weights * factor, self.means, self.covariances, self.labels)
 
     @eqx.filter_jit
@@ -124,18 +124,18 @@ class Mixture(eqx.Module):
 
     @eqx.filter_jit
     def gaussian(self) -> Gaussian:
-        """The normal with the moments of the mixture (of its density, that is divided by the mass)."""
+        """The normal density with the mean and covariance of the mixture, normalized by its mass."""
         best = jnp.argmax(self.weights)
         center = jax.tree.map(lambda leaf: leaf[best], self.means)
         total = jnp.where(self.mass > 0.0, self.mass, 1.0)
         shares = jnp.where(self.mass > 0.0, self.weights / total, 1.0 / self.capacity)
         for _ in range(1 if is_flat(center) else _MEAN_STEPS):
-            start = center
-            shift = matmul(shares, jax.vmap(lambda mean, start=start: local(start, mean))(self.means))
+            base = center
+            shift = matmul(shares, jax.vmap(lambda mean, base=base: local(base, mean))(self.means))
             center = retract(center, shift)
-        apart = jax.vmap(lambda mean: local(center, mean))(self.means)
+        deviations = jax.vmap(lambda mean: local(center, mean))(self.means)
         within = jnp.sum(shares[:, None, None] * self.covariances, axis=0)
-        return Gaussian(center, within + matmul(apart.T, shares[:, None] * apart))
+        return Gaussian(center, within + matmul(deviations.T, shares[:, None] * deviations))
 
     def roots(self) -> Float[Array, "k d d"]:
         """Lower triangular roots of the covariances."""

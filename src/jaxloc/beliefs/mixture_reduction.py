@@ -1,9 +1,9 @@
-"""Fewer components for almost the same mixture: pruned, merged where they say the same, and capped.
+"""Gaussian mixture reduction: pruning, merging of close components, and a cap on their number.
 
-Components are sorted by weight. The heaviest leads, and takes in all that are close to it; the heaviest of the rest
-leads next. That greedy order is settled for all components at once, in as many rounds as leaders depend on each other
-(a handful), each a product of a vector by the matrix of who is close to whom: nothing runs one component after another,
-so the reduction is as quick under `jax.vmap`.
+Components are sorted by weight. The heaviest absorbs all that are close to it, then the heaviest of the rest, and so
+on. This greedy clustering is found for all components at once, in as many rounds as cluster centers depend on each
+other (a handful), each a product of a vector with the matrix of close pairs: there is no loop over components, so that
+the reduction is fast under `jax.vmap`.
 """
 
 from abc import abstractmethod
@@ -22,17 +22,17 @@ from jaxloc.poses import carry, is_flat, local, retract
 
 
 class Closeness(eqx.Module):
-    """When a component is taken in by a heavier one: where its distance to it is at most the threshold."""
+    """Distance for merging: a component is absorbed by a heavier one at most the threshold away."""
 
     threshold: eqx.AbstractVar[float | Float[Array, ""]]
 
     @abstractmethod
     def distances(self, mixture: Mixture) -> Float[Array, "k k"]:
-        """Distance of each component (column) to each that may lead (row)."""
+        """Distance of each component (column) to each that may absorb it (row)."""
 
 
 class MahalanobisDistance(Closeness):
-    """``(m_i - m_j)^T P_i^-1 (m_i - m_j)`` of component i to leader j.
+    """``(m_i - m_j)^T P_i^-1 (m_i - m_j)`` of component i to cluster center j.
 
     References:
         Vo and Ma 2006, table II [T-83], [T-84].
@@ -41,12 +41,12 @@ class MahalanobisDistance(Closeness):
     threshold: float | Float[Array, ""] = 4.0
 
     def distances(self, mixture: Mixture) -> Float[Array, "k k"]:
-        """In the covariance of the component that would be taken in."""
+        """In the covariance of the component that would be absorbed."""
         return _mahalanobis(mixture.means, mixture.roots())
 
 
 class KullbackLeibler(Closeness):
-    """``KL(N_i || N_j) = (tr P_j^-1 P_i + d^T P_j^-1 d - n + log |P_j| / |P_i|) / 2`` of component i to leader j.
+    """``KL(N_i || N_j) = (tr P_j^-1 P_i + d^T P_j^-1 d - n + log |P_j| / |P_i|) / 2`` of component i to center j.
 
     References:
         Runnalls, "Kullback-Leibler approach to Gaussian mixture reduction", IEEE TAES 2007 [T-83], [T-92].
@@ -55,25 +55,25 @@ class KullbackLeibler(Closeness):
     threshold: float | Float[Array, ""] = 1.0
 
     def distances(self, mixture: Mixture) -> Float[Array, "k k"]:
-        """Information lost in nats, when the leader stands for the component."""
+        """Information loss in nats when the cluster center replaces the component."""
         roots = mixture.roots()
         size = roots.shape[-1]
-        apart = _mahalanobis(mixture.means, roots).T
+        squared = _mahalanobis(mixture.means, roots).T
         volumes = jnp.sum(jnp.log(jnp.diagonal(roots, axis1=-2, axis2=-1)), axis=-1)
         eye = jnp.eye(size, dtype=roots.dtype)
         inverse = jax.vmap(lambda root: whiten(root, eye))(roots)
         precisions = matmul(inverse.mT, inverse)
         traces = matmul(precisions.reshape(-1, size * size), mixture.covariances.reshape(-1, size * size).T)
-        return 0.5 * (traces + apart - size) + volumes[:, None] - volumes[None, :]
+        return 0.5 * (traces + squared - size) + volumes[:, None] - volumes[None, :]
 
 
 class Reduced(eqx.Module):
-    """A smaller mixture.
+    """A reduced mixture.
 
     Attributes:
-        mixture: with the wanted number of slots, heaviest first; labels are those of the leaders.
-        lost: weight that was pruned, or found no room.
-        crowded: components above the pruning threshold that found no room.
+        mixture: with the requested number of slots, heaviest first; labels are those of the cluster centers.
+        lost: weight that was pruned or dropped for lack of slots.
+        crowded: number of components above the pruning threshold that were dropped for lack of slots.
     """
 
     mixture: Mixture
@@ -90,19 +90,19 @@ def reduce_mixture(
     closeness: Closeness = MahalanobisDistance(),  # noqa: B008 (a record that never changes)
     candidates: int | None = None,
 ) -> Reduced:
-    """Drops light components, merges close ones, keeps the heaviest.
+    """Prunes light components, merges close ones, keeps the heaviest.
 
-    Merged moments are those of the sum (the spread of the means included), so that mass, mean and covariance are kept.
+    Merging matches moments (the dispersion of the means included), so that mass, mean and covariance are kept.
 
     Args:
         mixture: any number of components.
         capacity: slots of the result.
         prune: weights below it are dropped.
         closeness: which components are merged.
-        candidates: at most so many components take part in merging, the heaviest; None for all.
+        candidates: largest number of components that take part in merging, the heaviest; None for all.
 
     Returns:
-        The mixture, and what was lost.
+        The mixture, and its loss.
 
     References:
         Vo and Ma 2006, table II [T-83].
@@ -136,7 +136,7 @@ def _mahalanobis(means: Any, roots: Float[Array, "k d d"]) -> Float[Array, "k k"
     first = jax.tree.map(lambda leaf: leaf[0], means)
     if not is_flat(first):
         return jax.vmap(lambda center: _to_one(means, roots, center))(means)
-    # Forward substitution for all pairs at once, which the compiler makes a single pass over contiguous numbers.
+    # Forward substitution for all pairs at once, which compiles to a single pass over contiguous memory.
     points = jax.vmap(lambda mean: local(first, mean))(means)
     total, whitened = jnp.zeros((len(roots), len(roots)), roots.dtype), []
     for i in range(roots.shape[-1]):
@@ -149,53 +149,53 @@ def _mahalanobis(means: Any, roots: Float[Array, "k d d"]) -> Float[Array, "k k"
 
 
 def _to_one(means: Any, roots: Float[Array, "k d d"], center: Any) -> Float[Array, " k"]:
-    apart = jax.vmap(lambda mean: local(mean, center))(means)
-    return jnp.sum(jax.vmap(whiten)(roots, apart) ** 2, axis=-1)
+    deltas = jax.vmap(lambda mean: local(mean, center))(means)
+    return jnp.sum(jax.vmap(whiten)(roots, deltas) ** 2, axis=-1)
 
 
 def _owners(close: Bool[Array, "k k"], valid: Bool[Array, " k"]) -> Int[Array, " k"]:
-    """The leader of each component, of sorted ones: who leads depends on who led before."""
+    """Cluster center of each component of a sorted mixture."""
     num = valid.shape[0]
     earlier = jnp.triu(jnp.ones((num, num), bool), 1)
     reach = close & earlier & valid[:, None]
 
-    def settle(state):
-        free, leads = state
+    def advance(state):
+        free, centers = state
         blocked = jnp.any(reach & free[:, None], axis=0)
-        taken = jnp.any(reach & leads[:, None], axis=0)
+        taken = jnp.any(reach & centers[:, None], axis=0)
         new = free & ~blocked & ~taken
-        return free & ~taken & ~new, leads | new
+        return free & ~taken & ~new, centers | new
 
-    _, leads = lax.while_loop(lambda state: jnp.any(state[0]), settle, (valid, jnp.zeros_like(valid)))
+    _, centers = lax.while_loop(lambda state: jnp.any(state[0]), advance, (valid, jnp.zeros_like(valid)))
     own = jnp.eye(num, dtype=bool) & valid[:, None]
-    return jnp.argmax((reach | own) & leads[:, None], axis=0)
+    return jnp.argmax((reach | own) & centers[:, None], axis=0)
 
 
 def _merge(mixture: Mixture, owners: Int[Array, " k"]) -> Mixture:
-    """The moments of each leader's followers, in the leader's slot."""
+    """Moments of each cluster, in the slot of its center."""
     num, size = mixture.capacity, mixture.covariances.shape[-1]
-    leaders = jax.tree.map(lambda leaf: leaf[owners], mixture.means)
-    shifts = jax.vmap(local)(leaders, mixture.means)
-    spreads = mixture.covariances
+    centers = jax.tree.map(lambda leaf: leaf[owners], mixture.means)
+    shifts = jax.vmap(local)(centers, mixture.means)
+    covariances = mixture.covariances
     flat = is_flat(jax.tree.map(lambda leaf: leaf[0], mixture.means))
     if not flat:
-        spreads = _carried(mixture.means, jnp.zeros((num, size), spreads.dtype), leaders, spreads)
-    spreads = spreads + shifts[:, :, None] * shifts[:, None, :]
-    moments = jnp.concatenate([shifts, spreads.reshape(num, -1)], axis=1) * mixture.weights[:, None]
+        covariances = _transported(mixture.means, jnp.zeros((num, size), covariances.dtype), centers, covariances)
+    covariances = covariances + shifts[:, :, None] * shifts[:, None, :]
+    moments = jnp.concatenate([shifts, covariances.reshape(num, -1)], axis=1) * mixture.weights[:, None]
     share = (owners[None, :] == jnp.arange(num)[:, None]) & mixture.valid[None, :]
-    share = share.astype(spreads.dtype)
+    share = share.astype(covariances.dtype)
     weights = matmul(share, mixture.weights)
-    there = weights > 0.0
-    sums = matmul(share, moments) / jnp.where(there, weights, 1.0)[:, None]
+    nonempty = weights > 0.0
+    sums = matmul(share, moments) / jnp.where(nonempty, weights, 1.0)[:, None]
     shift = sums[:, :size]
     covariances = sums[:, size:].reshape(num, size, size) - shift[:, :, None] * shift[:, None, :]
-    covariances = jnp.where(there[:, None, None], covariances, mixture.covariances)
+    covariances = jnp.where(nonempty[:, None, None], covariances, mixture.covariances)
     means = jax.vmap(retract)(mixture.means, shift)
-    covariances = covariances if flat else _carried(mixture.means, shift, means, covariances)
+    covariances = covariances if flat else _transported(mixture.means, shift, means, covariances)
     return Mixture(weights, means, covariances, mixture.labels)
 
 
-def _carried(
+def _transported(
     means: Any, deltas: Float[Array, "k d"], targets: Any, covariances: Float[Array, "k d d"]
 ) -> Float[Array, "k d d"]:
     """Covariances in the tangent spaces of the targets."""

@@ -1,4 +1,4 @@
-"""What filters assume: how a state moves on, and what a sensor reads there, as densities with tangent noise."""
+"""Motion and sensor models: transition and measurement densities with noise in the tangent space."""
 
 import math
 from abc import abstractmethod
@@ -18,7 +18,7 @@ from jaxloc.poses import local, retract, tangent_dimension
 class Motion(eqx.Module):
     """The transition density ``p(x' | x, u)``: ``x' = retract(move(x, u), w)``, ``w ~ N(0, covariance(x, u))``.
 
-    States are vectors, poses, or any pytree of them; a control holds whatever one step needs, such as its ``dt``.
+    States are vectors, poses, or any pytree of them; a control holds the inputs of one step, such as its ``dt``.
     Parameters that may be learned are array fields.
     """
 
@@ -35,20 +35,20 @@ class Motion(eqx.Module):
         return _linearize(lambda x: self.move(x, control), state)
 
     def noise_dimension(self, state: Any) -> int:
-        """How many standard normal numbers `perturb` takes: those of the tangent, unless it is overridden."""
+        """Number of standard normal numbers of `perturb`: the tangent dimension unless overridden."""
         return tangent_dimension(state)
 
     def perturb(self, state: Any, control: Any, normal: Float[Array, " k"]) -> Any:
-        """The next state that standard normal numbers lead to: ``retract(move(x, u), L n)``, ``L L^T = covariance``.
+        """The next state for standard normal numbers: ``retract(move(x, u), L n)``, ``L L^T = covariance``.
 
         Particle filters draw the numbers of all particles at once and map this over them. Override it (and
-        `noise_dimension`) where noise has a simpler form, or is not a normal in the tangent space.
+        `noise_dimension`) where noise has a simpler form, or is not normal in the tangent space.
         """
         root = cholesky(self.covariance(state, control))
         return retract(self.move(state, control), matmul(root, normal))
 
     def sample(self, state: Any, control: Any, *, key: Key[Array, ""]) -> Any:
-        """One random next state: `perturb` by fresh numbers."""
+        """One random next state: `perturb` by new random numbers."""
         normal = jax.random.normal(key, (self.noise_dimension(state),), dtype_of(state))
         return self.perturb(state, control, normal)
 
@@ -61,30 +61,41 @@ class Motion(eqx.Module):
 class Sensor(eqx.Module):
     """The measurement density ``p(z | x)``: ``z = retract(expect(x, z), v)``, ``v ~ N(0, covariance(x, z))``.
 
-    Measurements are any pytrees: put an angle in as `SO2`, and differences wrap by themselves. `expect` and
-    `covariance` see the measurement for its identity alone (which landmark, which beacon, which beams: integer leaves),
-    never for the values read.
+    Measurements are any pytrees; give angles as `jaxloc.poses.SO2`, so that differences wrap. `expect` and
+    `covariance` get the measurement for its identity only (which landmark, which beacon, which beams: integer leaves),
+    not for its values.
+
+    The covariance is ordered as the tangent of the measurement: as its leaves are. JAX orders the entries of a dict
+    **alphabetically by key**, not by insertion: of ``{"range": r, "bearing": b}`` the bearing comes first. Records
+    (`equinox.Module`) and tuples keep the order of their fields. `jaxloc.poses.tangent_labels` of a measurement shows
+    the order.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> measurement = {"range": jnp.array(5.0), "bearing": jl.poses.SO2.from_angle(0.1)}
+        >>> jl.poses.tangent_labels(measurement)
+        ('bearing.rotation', 'range')
     """
 
     @abstractmethod
     def expect(self, state: Any, measurement: Any) -> Any:
-        """What the sensor would read without noise, with the structure of the measurement."""
+        """The measurement predicted without noise, with the structure of the measurement."""
 
     @abstractmethod
     def covariance(self, state: Any, measurement: Any) -> Float[Array, "m m"]:
         """Covariance of the noise in the tangent space of the measurement."""
 
     def linearize(self, state: Any, measurement: Any) -> tuple[Any, Float[Array, "m d"]]:
-        """The expected measurement and its Jacobian by the tangent of the state; override where it is short."""
+        """The predicted measurement and its Jacobian by the tangent of the state; override where it is short."""
         return _linearize(lambda x: self.expect(x, measurement), state)
 
     def log_prob(self, state: Any, measurement: Any, valid: Bool[Array, "*m"]) -> Float[Array, ""]:
-        """Log density of a measurement; entries that are not valid, or not finite, count nothing.
+        """Log density of a measurement; invalid and non-finite entries are ignored.
 
         Args:
             state: state at which it is evaluated.
-            measurement: what was read.
-            valid: one truth value, or one for each tangent direction of the measurement.
+            measurement: the measurement.
+            valid: one Boolean, or one for each tangent direction of the measurement.
         """
         residual, mask = innovation(self.expect(state, measurement), measurement, valid)
         return log_normal(residual, self.covariance(state, measurement), mask)
@@ -93,12 +104,12 @@ class Sensor(eqx.Module):
 def innovation(
     expected: Any, measurement: Any, valid: Bool[Array, "*m"]
 ) -> tuple[Float[Array, " m"], Bool[Array, " m"]]:
-    """The difference of a measurement from the expected one, and which of its directions count.
+    """The innovation of a measurement: measured minus predicted, and the mask of its valid directions.
 
     Args:
-        expected: what the sensor should read.
-        measurement: what it read; entries that are not finite are masked.
-        valid: one truth value, or one for each tangent direction.
+        expected: the predicted measurement.
+        measurement: the measurement; non-finite entries are masked.
+        valid: one Boolean, or one for each tangent direction.
 
     Returns:
         ``local(expected, measurement)``, zero where masked, and the mask.
@@ -112,13 +123,13 @@ def innovation(
     """
     finite = jnp.isfinite(local(lax.stop_gradient(expected), lax.stop_gradient(measurement)))
     mask = finite & jnp.broadcast_to(valid, finite.shape)
-    # Bad numbers are replaced before they are used: their derivatives would be bad as well.
+    # Non-finite values are replaced before they are used: their derivatives would be non-finite as well.
     safe = jax.tree.map(_finite_or, measurement, expected)
     return jnp.where(mask, local(expected, safe), 0.0), mask
 
 
 def mask_covariance(covariance: Float[Array, "m m"], mask: Bool[Array, " m"]) -> Float[Array, "m m"]:
-    """The covariance with masked directions cut loose: unit variance, correlated with nothing.
+    """The covariance with unit variance and zero correlation in masked directions.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -132,7 +143,7 @@ def mask_covariance(covariance: Float[Array, "m m"], mask: Bool[Array, " m"]) ->
 def log_normal(
     residual: Float[Array, " m"], covariance: Float[Array, "m m"], mask: Bool[Array, " m"]
 ) -> Float[Array, ""]:
-    """Log density of a residual under a normal of mean zero; masked directions count nothing.
+    """Log density of a residual under a normal of mean zero; masked directions are ignored.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -164,9 +175,9 @@ def _finite_or(value: Any, fallback: Any) -> Any:
 
 
 def _linearize(function: Any, state: Any) -> tuple[Any, Array]:
-    image = function(state)
+    value = function(state)
 
     def in_tangent(delta):
-        return local(image, function(retract(state, delta)))
+        return local(value, function(retract(state, delta)))
 
-    return image, jax.jacfwd(in_tangent)(jnp.zeros(tangent_dimension(state), dtype_of(state)))
+    return value, jax.jacfwd(in_tangent)(jnp.zeros(tangent_dimension(state), dtype_of(state)))

@@ -1,4 +1,4 @@
-"""Densities as weighted samples of any state, and the estimates that can be read from them."""
+"""Particle sets: weighted samples of any state, and estimates from them."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from jaxloc.beliefs.models import dtype_of
 from jaxloc.poses import SE2, SE3, SO2, SO3, local, retract
 from jaxloc.poses.lie_group import Group
 
-NOTHING = -1e30  # log weight of a particle without weight: finite, so that sums and gradients of it are
+NOTHING = -1e30  # log weight of zero weight: finite, so that sums and gradients are finite
 _SQUARINGS = 5
 
 
@@ -24,9 +24,9 @@ class Particles(eqx.Module):
 
     Args:
         values: a pytree of arrays and poses, stacked along a leading axis "n".
-        log_weights: "n"; None for equal ones. A weight that is not a number, or infinite, counts as zero; where every
-            weight is zero all estimates take the valid particles as equal.
-        valid: "n", which places of the stack are in use; None for all. The rest weigh nothing.
+        log_weights: "n"; None for equal ones. A NaN or infinite weight counts as zero; where every weight is zero,
+            all estimates weight the valid particles equally.
+        valid: "n", mask of the slots in use; None for all. The others have no weight.
 
     References:
         Review section 3.1 [R-5]; Gordon, Salmond, Smith, "Novel approach to nonlinear/non-Gaussian Bayesian state
@@ -54,14 +54,14 @@ class Particles(eqx.Module):
 
     @staticmethod
     def from_gaussian(gaussian: Gaussian, num_particles: int, *, key: Key[Array, ""]) -> "Particles":
-        """Equal particles drawn from a normal density."""
+        """Equally weighted particles sampled from a normal density."""
         return Particles(gaussian.sample(num_particles, key=key))
 
     @staticmethod
     def uniform(
         lower: Float[Array, " d"], upper: Float[Array, " d"], num_particles: int, *, key: Key[Array, ""]
     ) -> "Particles":
-        """Equal particles over a box of vectors."""
+        """Equally weighted particles, uniform over a box of vectors."""
         fraction = jax.random.uniform(key, (num_particles, lower.shape[0]), lower.dtype)
         return Particles(lower[None, :] + fraction * (upper - lower)[None, :])
 
@@ -69,19 +69,19 @@ class Particles(eqx.Module):
     def uniform_planar(
         lower: Float[Array, "2"], upper: Float[Array, "2"], num_particles: int, *, key: Key[Array, ""]
     ) -> "Particles":
-        """Equal planar poses over a rectangle (m), of any heading [R-11, R-13]."""
+        """Equally weighted planar poses, uniform over a rectangle (m) and all headings [R-11, R-13]."""
         fraction = jax.random.uniform(key, (num_particles, 3), lower.dtype)
         xy = lower[None, :] + fraction[:, :2] * (upper - lower)[None, :]
         return Particles(jax.vmap(SE2)(xy[:, 0], xy[:, 1], jnp.pi * (2.0 * fraction[:, 2] - 1.0)))
 
     @property
     def size(self) -> int:
-        """How many places the stack has."""
+        """Number of slots."""
         return self.log_weights.shape[-1]
 
     @property
     def count(self) -> Int[Array, ""]:
-        """How many of them are in use."""
+        """Number of slots in use."""
         return jnp.sum(self.valid, dtype=jnp.int32)
 
     @property
@@ -97,12 +97,12 @@ class Particles(eqx.Module):
 
     @property
     def log_mean_weight(self) -> Float[Array, ""]:
-        """Logarithm of the mean weight of the valid particles: of a target over its proposal, the log evidence."""
+        """Logarithm of the mean weight of the valid particles: in importance sampling, the log evidence."""
         return self.log_total - jnp.log(jnp.maximum(self.count, 1).astype(self.log_weights.dtype))
 
     @property
     def weights(self) -> Float[Array, " n"]:
-        """Weights that sum to one."""
+        """Normalized weights."""
         return jnp.where(self.valid, jnp.exp(self.normalize().log_weights), 0.0)
 
     @property
@@ -115,25 +115,25 @@ class Particles(eqx.Module):
         return 1.0 / jnp.maximum(jnp.sum(self.weights**2), float(jnp.finfo(self.log_weights.dtype).tiny))
 
     def normalize(self) -> "Particles":
-        """The same density with weights that sum to one, finite log weights, and equal ones where all were zero."""
+        """The same density with normalized, finite log weights; equal ones where all were zero."""
         log_weights = finite_log_weights(self)
         shifted = log_weights - lax.stop_gradient(jnp.max(log_weights)) - _log_sum(log_weights, self.valid)
         return Particles(self.values, jnp.where(self.valid, jnp.maximum(shifted, NOTHING), NOTHING), self.valid)
 
     def take(self, indices: Int[Array, " m"]) -> Any:
-        """Values of some particles, stacked; indices must lie in the stack."""
+        """Values of some particles, stacked; indices must be in range."""
         return jax.tree.map(lambda leaf: leaf.at[indices].get(mode="promise_in_bounds"), self.values)
 
     def best(self) -> Any:
-        """The particle of most weight [R-8]."""
+        """The particle of largest weight [R-8]."""
         index = jnp.argmax(finite_log_weights(self))
         return jax.tree.map(lambda leaf: leaf[index], self.values)
 
     def mean(self) -> Any:
         """Weighted mean [R-8].
 
-        Of arrays and positions the weighted sum, of headings the direction of the mean (cos, sin), of rotations in
-        space the one whose quaternion is nearest to all. Integers are those of the best particle.
+        Arrays and positions are averaged, headings by the mean (cos, sin), rotations in space by the quaternion
+        average. Integers are those of the best particle.
 
         References:
             Markley, Cheng, Crassidis, Oshman, "Averaging quaternions", J. Guidance 2007, eq. 12.
@@ -150,10 +150,10 @@ class Particles(eqx.Module):
     def local_mean(self, bandwidth: Float[Array, " d"]) -> Any:
         """Weighted mean around the best particle, by a normal kernel in its tangent space [R-8].
 
-        Other modes of the density, further away than some bandwidths, count nothing.
+        Other modes of the density, several bandwidths away, have no influence.
 
         Args:
-            bandwidth: sigma of the kernel for each tangent direction.
+            bandwidth: standard deviation of the kernel for each tangent direction.
 
         References:
             Dellaert, Fox, Burgard, Thrun, "Monte Carlo localization for mobile robots", ICRA 1999, section 3
@@ -167,10 +167,10 @@ class Particles(eqx.Module):
         return retract(best, jnp.sum(weights[:, None] * deltas, axis=0) / total)
 
     def deviations(self, center: Any) -> Float[Array, "n d"]:
-        """Tangents that lead from a value to each particle; zero where there is none."""
+        """Tangents from a value to each particle; zero for invalid ones."""
 
-        def one(value, there):
-            return local(center, tree.where(there, value, center))
+        def one(value, valid):
+            return local(center, tree.where(valid, value, center))
 
         return jax.vmap(one)(self.values, self.valid)
 
@@ -179,14 +179,14 @@ class Particles(eqx.Module):
         return self.gaussian().covariance
 
     def gaussian(self) -> Gaussian:
-        """The normal density of the same mean and covariance."""
+        """The normal density with the mean and covariance of the particles."""
         mean = self.mean()
         deltas = self.deviations(mean)
         return Gaussian(mean, matmul(deltas.T, self.weights[:, None] * deltas))
 
 
 def finite_log_weights(particles: Particles) -> Float[Array, " n"]:
-    """Log weights with `NOTHING` where a particle is not valid, or its weight is zero or no finite number.
+    """Log weights with `NOTHING` for invalid particles and for zero or non-finite weights.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -200,13 +200,13 @@ def finite_log_weights(particles: Particles) -> Float[Array, " n"]:
 
 
 def _log_sum(log_weights: Array, valid: Array) -> Array:
-    """Logarithm of the sum of the weights over the greatest; that of the number of valid ones where all are zero."""
+    """Logarithm of the sum of weights over the largest; of the number of valid particles where all are zero."""
     parts = jnp.where(valid, jnp.exp(log_weights - lax.stop_gradient(jnp.max(log_weights))), 0.0)
     return jnp.log(jnp.maximum(jnp.sum(parts), float(jnp.finfo(parts.dtype).tiny)))
 
 
 def _mean_array(values: Array, weights: Array) -> Array:
-    # Zero times an infinite value would be no number.
+    # Zero times infinity would be NaN.
     weights = weights.reshape(-1, *(1,) * (values.ndim - 1))
     return jnp.sum(jnp.where(weights > 0, weights * values, 0.0), axis=0)
 
@@ -214,7 +214,7 @@ def _mean_array(values: Array, weights: Array) -> Array:
 def _mean_pose(poses: Any, weights: Array, nearest: Any) -> Any:
     if len(poses.batch_shape) != 1:
         raise ValueError(
-            f"The mean takes one pose a particle; this leaf holds stacks of shape {poses.batch_shape[1:]}."
+            f"The mean takes one pose per particle; this leaf holds stacks of shape {poses.batch_shape[1:]}."
         )
     if isinstance(poses, SO2):
         return _direction(_mean_array(poses.cos, weights), _mean_array(poses.sin, weights), nearest)
@@ -226,7 +226,7 @@ def _mean_pose(poses: Any, weights: Array, nearest: Any) -> Any:
 
 
 def _direction(cos: Array, sin: Array, nearest: SO2) -> SO2:
-    """The rotation towards a point; headings that cancel each other have no mean, and the best one stands for it."""
+    """The rotation towards a point; where headings cancel, the best one is returned."""
     squared = cos**2 + sin**2
     good = squared > float(jnp.finfo(cos.dtype).eps) ** 2
     scale = 1.0 / jnp.sqrt(jnp.where(good, squared, 1.0))
@@ -236,7 +236,7 @@ def _direction(cos: Array, sin: Array, nearest: SO2) -> SO2:
 def _mean_rotation(rotations: SO3, weights: Array) -> SO3:
     quaternions = jax.vmap(lambda rotation: rotation.quaternion())(rotations)
     moment = matmul(quaternions.T, weights[:, None] * quaternions)
-    for _ in range(_SQUARINGS):  # the power that leaves the greatest eigenvector alone
+    for _ in range(_SQUARINGS):  # power iteration on the largest eigenvector
         moment = matmul(moment, moment)
         moment = moment / jnp.trace(moment)
     return SO3.from_quaternion(moment[jnp.argmax(jnp.diagonal(moment))])

@@ -1,4 +1,4 @@
-"""How a Gaussian passes through a function: by its derivative, by sigma points, or by samples."""
+"""Propagation of a Gaussian through a function: linearized, unscented, or sampled."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from jaxloc.beliefs.gaussian import Gaussian
 from jaxloc.beliefs.square_root import cholesky
 from jaxloc.poses import is_flat, local, retract
 
-_MEAN_STEPS = 3  # of the intrinsic mean on a manifold; the error shrinks as the square of the spread each time
+_MEAN_STEPS = 3  # of the intrinsic mean on a manifold; the error is squared each time
 
 
 @eqx.filter_jit
@@ -38,13 +38,13 @@ def propagate_linear(f: Callable[[Any], Any], gaussian: Gaussian) -> Gaussian:
         >>> round(float(jl.beliefs.propagate_linear(jnp.square, belief).covariance[0, 0]), 3)
         0.16
     """
-    image = f(gaussian.mean)
+    value = f(gaussian.mean)
 
     def in_tangent(delta):
-        return local(image, f(retract(gaussian.mean, delta)))
+        return local(value, f(retract(gaussian.mean, delta)))
 
     jacobian = jax.jacfwd(in_tangent)(jnp.zeros(gaussian.dimension, gaussian.covariance.dtype))
-    return Gaussian(image, matmul(matmul(jacobian, gaussian.covariance), jacobian.T))
+    return Gaussian(value, matmul(matmul(jacobian, gaussian.covariance), jacobian.T))
 
 
 @eqx.filter_jit
@@ -63,9 +63,9 @@ def propagate_unscented(
     Args:
         f: function of a value like the mean; gives any pytree of arrays and poses.
         gaussian: density of x.
-        alpha: spread of the sigma points.
+        alpha: scale of the sigma points' offsets.
         beta: correction of the central weight for the covariance.
-        kappa: secondary spread; None for ``max(3 - d, 0)``.
+        kappa: secondary scale; None for ``max(3 - d, 0)``.
 
     Returns:
         Density of f(x) in the tangent space of its mean.
@@ -84,17 +84,17 @@ def propagate_unscented(
         4.01
     """
     size = gaussian.dimension
-    spread = alpha**2 * (size + (max(3 - size, 0) if kappa is None else kappa))
-    if spread <= 0:
-        raise ValueError(f"propagate_unscented needs alpha^2 (d + kappa) > 0; it got {spread} for d = {size}.")
+    scale = alpha**2 * (size + (max(3 - size, 0) if kappa is None else kappa))
+    if scale <= 0:
+        raise ValueError(f"propagate_unscented needs alpha^2 (d + kappa) > 0; it got {scale} for d = {size}.")
     dtype = gaussian.covariance.dtype
-    offsets = spread**0.5 * cholesky(gaussian.covariance).T
+    offsets = scale**0.5 * cholesky(gaussian.covariance).T
     deltas = jnp.concatenate([jnp.zeros((1, size), dtype), offsets, -offsets])
-    weights = np.r_[1.0 - size / spread, np.full(2 * size, 0.5 / spread)]
+    weights = np.r_[1.0 - size / scale, np.full(2 * size, 0.5 / scale)]
     weights_covariance = weights + np.r_[1.0 - alpha**2 + beta, np.zeros(2 * size)]
-    samples = _images(f, gaussian, deltas)
-    start = jax.tree.map(lambda leaf: leaf[0], samples)
-    return _moments(samples, start, jnp.asarray(weights, dtype), jnp.asarray(weights_covariance, dtype))
+    samples = _evaluate(f, gaussian, deltas)
+    first = jax.tree.map(lambda leaf: leaf[0], samples)
+    return _moments(samples, first, jnp.asarray(weights, dtype), jnp.asarray(weights_covariance, dtype))
 
 
 @eqx.filter_jit
@@ -107,7 +107,7 @@ def propagate_sampled(
         f: function of a value like the mean; gives any pytree of arrays and poses.
         gaussian: density of x.
         key: random key.
-        num_samples: number of draws, at least 2.
+        num_samples: number of samples, at least 2.
 
     Returns:
         Density of f(x) in the tangent space of its sample mean.
@@ -129,19 +129,21 @@ def propagate_sampled(
         raise ValueError(f"propagate_sampled needs at least 2 samples; it got {num_samples}.")
     dtype = gaussian.covariance.dtype
     normal = jax.random.normal(key, (num_samples, gaussian.dimension), dtype)
-    samples = _images(f, gaussian, matmul(normal, cholesky(gaussian.covariance).T))
+    samples = _evaluate(f, gaussian, matmul(normal, cholesky(gaussian.covariance).T))
     weights = jnp.full(num_samples, 1.0 / num_samples, dtype)
     return _moments(samples, f(gaussian.mean), weights, weights * (num_samples / (num_samples - 1)))
 
 
-def _images(f: Callable[[Any], Any], gaussian: Gaussian, deltas: Float[Array, "k d"]) -> Any:
+def _evaluate(f: Callable[[Any], Any], gaussian: Gaussian, deltas: Float[Array, "k d"]) -> Any:
     return jax.vmap(lambda delta: f(retract(gaussian.mean, delta)))(deltas)
 
 
-def _moments(samples: Any, start: Any, weights: Float[Array, " k"], weights_covariance: Float[Array, " k"]) -> Gaussian:
-    """Intrinsic mean of weighted samples, from a start near it, and the covariance around it."""
-    center = start
-    for _ in range(1 if is_flat(start) else _MEAN_STEPS):
+def _moments(
+    samples: Any, initial: Any, weights: Float[Array, " k"], weights_covariance: Float[Array, " k"]
+) -> Gaussian:
+    """Intrinsic mean of weighted samples, from an initial value near it, and the covariance about it."""
+    center = initial
+    for _ in range(1 if is_flat(initial) else _MEAN_STEPS):
         center = retract(center, jnp.sum(weights[:, None] * _deviations(center, samples), axis=0))
     deviations = _deviations(center, samples)
     return Gaussian(center, matmul(deviations.T, weights_covariance[:, None] * deviations))

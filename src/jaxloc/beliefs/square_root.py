@@ -1,4 +1,4 @@
-"""Square roots of covariances that stay finite when a covariance is singular to rounding."""
+"""Square roots of covariances: Cholesky, triangularization, solves and downdates, finite for singular ones."""
 
 from typing import Any
 
@@ -47,7 +47,7 @@ def cholesky(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
 
 
 def whiten(root: Float[Array, "d d"], residual: Float[Array, "d *k"]) -> Float[Array, "d *k"]:
-    """``L^-1 r``: residuals in sigmas, for the lower triangular root of their covariance.
+    """``L^-1 r``: whitened residuals, for the lower triangular root of their covariance.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -70,18 +70,18 @@ def solve(root: Float[Array, "d d"], right: Float[Array, "d *k"]) -> Float[Array
 
 @jax.custom_jvp
 def triangularize(deviations: Float[Array, "d k"]) -> Float[Array, "d d"]:
-    """Lower triangular ``L`` with ``L L^T = A A^T``, by orthogonal steps on the rows of ``A`` itself.
+    """Lower triangular ``L`` with ``L L^T = A A^T``, by orthogonal transformations of ``A`` itself (QR).
 
     The product ``A A^T`` is never formed, so the root has the accuracy of ``A``: in float32 a covariance whose largest
     and smallest variances are ``1e10`` apart keeps its small directions, which a Cholesky factor would lose. Rows may
-    be zero or depend on others; values and derivatives stay finite. (Where a pivot is zero the root has a kink, and its
-    derivative is that of the rest.)
+    be zero or depend on others; values and derivatives stay finite. (Where a pivot is zero the root is not
+    differentiable, and the derivative is that of the other pivots.)
 
     Args:
         deviations: "d k", any k; scaled deviations, or roots of covariances side by side.
 
     Returns:
-        "d d", lower triangular with a diagonal that is never negative.
+        "d d", lower triangular with a nonnegative diagonal.
 
     References:
         Björck, "Solving linear least squares problems by Gram-Schmidt orthogonalization", BIT 1967 (the triangular
@@ -104,7 +104,7 @@ def _triangularize_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Array
     (a,), (da,) = primals, tangents
     root = triangularize(a)
     size = root.shape[0]
-    # A row that depends on those above it has no direction of its own: it turns with them.
+    # A row that depends linearly on those above it has no direction of its own.
     floor = 8.0 * float(jnp.finfo(a.dtype).eps) * jnp.sqrt(jnp.sum(lax.stop_gradient(a) ** 2, axis=1))
     free = (jnp.diagonal(root) > floor)[:, None]
     eye = jnp.eye(size, dtype=a.dtype)
@@ -118,9 +118,9 @@ def _triangularize_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Array
 
 @jax.custom_jvp
 def product(a: Float[Array, "d k"], b: Float[Array, "k *n"]) -> Float[Array, "d *n"]:
-    """``A B`` of small matrices at full precision, quick in batches as well.
+    """``A B`` of small matrices at full precision, fast in batches.
 
-    Batched on both sides, a matrix product is a loop of library calls on a processor; here it is one vectorized loop.
+    Batched on both sides, a matrix product is a loop of library calls on a CPU; here it is one vectorized loop.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -141,9 +141,9 @@ def _product_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[A
 
 
 def downdate(root: Float[Array, "d d"], vector: Float[Array, " d"]) -> Float[Array, "d d"]:
-    """Lower triangular root of ``L L^T - x x^T``, never NaN.
+    """Cholesky downdate: lower triangular root of ``L L^T - x x^T``, finite in any case.
 
-    Where the difference is not positive, the vector is shortened until it is, by rounding.
+    Where the difference is not positive definite, the vector is shortened until it is, up to rounding.
 
     Args:
         root: lower triangular L.
@@ -191,7 +191,7 @@ def _(axis_size: int, in_batched: list[bool], stacks: Array) -> tuple[Array, boo
 
 
 def _gram_schmidt(rows: Array) -> Array:
-    """Modified Gram-Schmidt: each row leaves its length, and the parts of the later rows along it."""
+    """Modified Gram-Schmidt: the norm of each row, and the projections of the later rows onto it."""
     size, columns = rows.shape[0], []
     for i in range(size):
         first, rest = rows[0], rows[1:]
@@ -204,7 +204,7 @@ def _gram_schmidt(rows: Array) -> Array:
 
 
 def _gram_schmidt_stacked(stack: Array) -> Array:
-    """The same with the batch along the last axis, where it fills vector registers: several times as fast."""
+    """`_gram_schmidt` with the batch along the last axis, where it fills vector registers: several times as fast."""
     left = [jnp.moveaxis(stack[:, i], 0, -1) for i in range(stack.shape[1])]
     columns = []
     for i in range(stack.shape[1]):
@@ -214,7 +214,7 @@ def _gram_schmidt_stacked(stack: Array) -> Array:
         parts = [jnp.sum(row * direction, axis=0) for row in rest]
         left = [row - part[None] * direction for row, part in zip(rest, parts, strict=True)]
         columns.append(jnp.stack([jnp.zeros_like(length)] * i + [length, *parts], axis=-1))
-    # Without the barrier what comes after is merged with the last of this loop, and works it out again and again.
+    # Without the barrier, consumers are fused with the end of this loop and recompute it.
     return lax.optimization_barrier(jnp.stack(columns, axis=-1))
 
 

@@ -1,4 +1,4 @@
-"""The extended Kalman filter on any manifold: iterated, gated, robust."""
+"""Extended Kalman filter on manifolds: iterated, gated, with robust kernels."""
 
 from typing import Any
 
@@ -12,15 +12,15 @@ from jaxloc.beliefs.square_root import product, whiten
 from jaxloc.filters.interface import GaussianInfo, GaussianState
 from jaxloc.filters.kalman import (
     GaussianFilter,
-    Reading,
-    Spread,
-    judge,
+    Innovation,
+    JointCovariance,
+    apply_correction,
+    innovation_info,
+    linearized_innovation,
+    linearized_motion,
+    measurement_joint,
     noise_root,
-    read_linearized,
-    regular,
-    settle,
-    spread_motion,
-    spread_reading,
+    without_zero_pivots,
 )
 from jaxloc.poses import carry, is_flat, retract
 from jaxloc.solvers.robust_kernels import Loss, Quadratic
@@ -29,18 +29,18 @@ _SMALLEST_WEIGHT = 1e-8  # of a robust kernel: the noise of a rejected measureme
 
 
 class ExtendedKalmanFilter(GaussianFilter):
-    """Models linearized where the state is; states are vectors, poses, or any pytree of them.
+    """The extended Kalman filter (EKF); states are vectors, poses, or any pytree of them.
 
-    An update is Gauss-Newton on ``|local(x-, x)|^2_P + |z - h(x)|^2_R``. One iteration is the usual extended filter;
-    more of them linearize again where the last one ended. The covariance of a pose is carried to the tangent space of
-    its new mean. What the info says (innovation, NIS, likelihood) is of the linearization at the predicted state.
+    An update is Gauss-Newton on ``|local(x-, x)|^2_P + |z - h(x)|^2_R``. One iteration is the usual EKF; more
+    of them linearize again at the last result (iterated EKF). The covariance of a pose is transported to the tangent
+    space of its new mean. The info (innovation, NIS, likelihood) is of the linearization at the predicted state.
 
     Args:
         motion: how the state moves.
         sensor: what is measured.
         iterations: Gauss-Newton steps of an update, at least 1.
-        gate: probability that a right measurement passes the chi-square gate; one that does not leaves the state as it
-            was, and counts nothing in the likelihood. None for no gate.
+        gate: probability that a measurement from the model passes the chi-square gate; one that does not leaves the
+            state unchanged and does not enter the likelihood. None for no gate.
         loss: robust kernel of the whole measurement, in sigmas: the noise covariance is divided by its weight, which
             is taken at the innovation in the first iteration and at the residual after that.
 
@@ -79,34 +79,34 @@ class ExtendedKalmanFilter(GaussianFilter):
         if self.gate is not None and not 0.0 < self.gate < 1.0:
             raise ValueError(f"The gate is a probability between 0 and 1; got {self.gate}.")
 
-    def move(self, state: GaussianState, control: Any) -> Spread:
-        """By the derivative of the motion."""
-        return spread_motion(self.motion, state, control)
+    def predict_joint(self, state: GaussianState, control: Any) -> JointCovariance:
+        """By the derivative of the motion at the mean."""
+        return linearized_motion(self.motion, state, control)
 
-    def read(self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]) -> Reading:
+    def innovation(self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]) -> Innovation:
         """By the derivative of the sensor at the mean."""
-        return read_linearized(self.sensor, state, measurement, valid)
+        return linearized_innovation(self.sensor, state, measurement, valid)
 
     def update(
         self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[GaussianState, GaussianInfo]:
-        """The state given a measurement."""
+        """The state updated by a measurement."""
         del key
-        reading = self.read(state, measurement, valid)
-        root = reading.spread.root()
-        info = judge(root, reading, self.gate)
+        found = self.innovation(state, measurement, valid)
+        root = found.joint.root()
+        info = innovation_info(root, found, self.gate)
         if not isinstance(self.loss, Quadratic):
-            root = _reweighted(reading.spread, self.loss.weight(info.nis)).root()
+            root = _reweighted(found.joint, self.loss.weight(info.nis)).root()
         delta, rest = _step(root, info.innovation)
         for _ in range(self.iterations - 1):
             safe = jnp.where(info.ok & info.accepted & jnp.all(jnp.isfinite(delta)), delta, 0.0)
-            delta, rest = self._again(state, measurement, reading.mask, safe)
-        return settle(state, delta, rest, info), info
+            delta, rest = self._relinearized(state, measurement, found.mask, safe)
+        return apply_correction(state, delta, rest, info), info
 
-    def _again(
+    def _relinearized(
         self, state: GaussianState, measurement: Any, mask: Bool[Array, " m"], delta: Float[Array, " d"]
     ) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
-        """A Gauss-Newton step from a point ``delta`` away from the prior mean, in the tangent space of that mean."""
+        """A Gauss-Newton step linearized ``delta`` away from the prior mean, in the tangent space of that mean."""
         value = retract(state.mean, delta)
         expected, jacobian = self.sensor.linearize(value, measurement)
         residual, mask = innovation(expected, measurement, mask)
@@ -115,21 +115,21 @@ class ExtendedKalmanFilter(GaussianFilter):
         if not is_flat(state.mean):
             jacobian = product(jacobian, carry(state.mean, delta, value))
         residual = jnp.where(mask, residual, 0.0)
-        spread = spread_reading(expected, noise, product(jacobian, state.covariance_sqrt), state)
+        joint = measurement_joint(expected, noise, product(jacobian, state.covariance_sqrt), state)
         if not isinstance(self.loss, Quadratic):
-            spread = _reweighted(spread, self.loss.weight(jnp.sum(whiten(noise, residual) ** 2)))
-        return _step(spread.root(), residual + product(jacobian, delta))
+            joint = _reweighted(joint, self.loss.weight(jnp.sum(whiten(noise, residual) ** 2)))
+        return _step(joint.root(), residual + product(jacobian, delta))
 
 
 def _step(root: Float[Array, "n n"], residual: Float[Array, " m"]) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
-    """The most probable tangent given an innovation, and the root of what remains uncertain."""
+    """Posterior tangent and covariance root given an innovation."""
     size = residual.shape[0]
-    return product(root[size:, :size], whiten(regular(root[:size, :size]), residual)), root[size:, size:]
+    return product(root[size:, :size], whiten(without_zero_pivots(root[:size, :size]), residual)), root[size:, size:]
 
 
-def _reweighted(spread: Spread, weight: Float[Array, ""]) -> Spread:
-    """The spread with the measurement noise divided by a weight."""
-    size = spread.image.shape[0]
-    larger = 1.0 / jnp.sqrt(jnp.maximum(weight, _SMALLEST_WEIGHT))
-    image = jnp.concatenate([spread.image[:, :size] * larger, spread.image[:, size:]], axis=1)
-    return Spread(spread.mean, image, spread.source)
+def _reweighted(joint: JointCovariance, weight: Float[Array, ""]) -> JointCovariance:
+    """The joint covariance with the measurement noise divided by a weight."""
+    size = joint.output.shape[0]
+    scale = 1.0 / jnp.sqrt(jnp.maximum(weight, _SMALLEST_WEIGHT))
+    output = jnp.concatenate([joint.output[:, :size] * scale, joint.output[:, size:]], axis=1)
+    return JointCovariance(joint.mean, output, joint.input)

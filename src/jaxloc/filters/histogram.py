@@ -1,4 +1,4 @@
-"""The grid filter: Bayes' rule on cells, exact as the cells shrink, for small worlds and as a reference for others."""
+"""Histogram (grid) filter: the Bayes filter on a grid of cells, for small state spaces and as a reference."""
 
 from typing import Any
 
@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, Motion, Sensor
 from jaxloc.beliefs.models import innovation
 from jaxloc.filters.interface import Filter, FilterState, Info
-from jaxloc.filters.kalman import finite_or_zero, select
 from jaxloc.filters.unscented import intrinsic_mean
 from jaxloc.poses import SE2
 
 
 class Cells(eqx.Module):
-    """Points that tile a region of states.
+    """Cells that tile a region of the state space.
 
     Attributes:
         points: centers, stacked along a leading axis; vectors, poses, or any pytree of them.
@@ -35,12 +35,12 @@ class Cells(eqx.Module):
 
 
 class GridState(FilterState):
-    """Probability in every cell.
+    """State of the grid filter.
 
     Attributes:
-        cells: where.
-        mass: how much; adds up to one.
-        step: how many predictions led here.
+        cells: the grid.
+        mass: probability of each cell; sums to one.
+        step: number of predictions so far.
     """
 
     cells: Cells
@@ -59,11 +59,11 @@ class GridState(FilterState):
 
 
 class GridInfo(Info):
-    """What an update of a grid says.
+    """Diagnostics of an update of the grid filter.
 
     Attributes:
         log_likelihood: of the measurement given all earlier ones; zero where there is none.
-        ok: whether some cell can explain the measurement.
+        ok: whether any cell has a positive likelihood.
         entropy: of the mass after the update, nats.
     """
 
@@ -73,14 +73,14 @@ class GridInfo(Info):
 
 
 class GridFilter(Filter):
-    """Bayes' filter with the transition density between all pairs of cells, and the likelihood in each.
+    """The Bayes filter with the transition density between all pairs of cells, and the likelihood in each.
 
-    A prediction costs the square of the number of cells, so this is for some thousand of them. Mass that would leave
-    the region stays in it, shared as the transition density shares it among the cells.
+    A prediction costs the square of the number of cells: use at most some thousands. Transition densities are
+    normalized over the cells, so that no mass leaves the region.
 
     Args:
-        motion: how the state moves; its noise must be as wide as a cell at least, or cells fall between cells.
-        sensor: what is measured.
+        motion: motion model; the standard deviation of its noise must be at least the size of a cell.
+        sensor: sensor model.
 
     References:
         Review section 3, eqs. 1-5 [R-1, R-2, R-3, R-4]; Thesis eqs. 1.1, 1.2 and Fig. 2.17 [T-1, T-3, T-55].
@@ -90,7 +90,7 @@ class GridFilter(Filter):
         >>> eye = jnp.eye(1)
         >>> filt = jl.filters.GridFilter(jl.filters.LinearMotion(eye, eye), jl.filters.LinearSensor(eye, eye))
         >>> cells = jl.filters.histogram.box((-9.0,), (9.0,), (61,))
-        >>> state = filt.spread(cells, jl.beliefs.Gaussian(jnp.zeros(1), eye))
+        >>> state = filt.init_gaussian(cells, jl.beliefs.Gaussian(jnp.zeros(1), eye))
         >>> state, info = filt.update(filt.predict(state, None), jnp.array([3.0]), jnp.array(True))
         >>> round(float(state.gaussian().mean[0]), 2)  # the Kalman filter says 2
         2.0
@@ -100,25 +100,25 @@ class GridFilter(Filter):
     sensor: Sensor
 
     def init(self, prior: Cells) -> GridState:
-        """The state of knowing nothing but the region."""
+        """The uniform initial state over the cells."""
         mass = jnp.full(prior.count, 1.0 / prior.count, prior.volume.dtype)
         return GridState(prior, mass, jnp.zeros((), jnp.int32))
 
-    def spread(self, cells: Cells, prior: Gaussian) -> GridState:
-        """The state of a prior density."""
+    def init_gaussian(self, cells: Cells, prior: Gaussian) -> GridState:
+        """The initial state of a prior density."""
         mass = jax.nn.softmax(jax.vmap(prior.log_prob)(cells.points))
         return GridState(cells, mass, jnp.zeros((), jnp.int32))
 
     def predict(self, state: GridState, control: Any, *, key: Key[Array, ""] | None = None) -> GridState:
-        """The state one step later: the mass of each cell goes to all others by the transition density."""
+        """The state one step ahead: mass moves between cells by the transition density."""
         del key
-        points, control = state.cells.points, finite_or_zero(control)
+        points, control = state.cells.points, tree.finite_or_zero(control)
 
-        def leaves(point):
+        def transition(point):
             shares = jax.vmap(lambda target: self.motion.log_prob(point, control, target))(points)
             return jax.nn.softmax(jnp.where(jnp.isfinite(shares), shares, -jnp.inf), where=jnp.isfinite(shares))
 
-        mass = matmul(state.mass, jax.vmap(leaves)(points))
+        mass = matmul(state.mass, jax.vmap(transition)(points))
         mass = mass / jnp.sum(mass)
         ok = jnp.isfinite(jnp.sum(mass))
         return GridState(state.cells, jnp.where(ok, mass, state.mass), state.step + 1)
@@ -126,7 +126,7 @@ class GridFilter(Filter):
     def update(
         self, state: GridState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[GridState, GridInfo]:
-        """The state given a measurement."""
+        """The state updated by a measurement."""
         del key
         scores = jax.vmap(lambda point: self.sensor.log_prob(point, measurement, valid))(state.cells.points)
         fits = jnp.isfinite(scores) & (state.mass > 0.0)
@@ -135,15 +135,15 @@ class GridFilter(Filter):
         ok = jnp.any(fits)
         likelihood = jax.nn.logsumexp(jnp.where(ok, joint, 0.0))
         mass = jnp.where(ok, jnp.exp(jnp.where(fits, joint - likelihood, -jnp.inf)), state.mass)
-        seen = jnp.any(self._seen(state, measurement, valid))
-        after = select(seen, GridState(state.cells, mass, state.step), state)
+        seen = jnp.any(self._mask(state, measurement, valid))
+        after = tree.where(seen, GridState(state.cells, mass, state.step), state)
         entropy = -jnp.sum(
             jnp.where(after.mass > 0.0, after.mass * jnp.log(jnp.where(after.mass > 0.0, after.mass, 1.0)), 0.0)
         )
         return after, GridInfo(jnp.where(ok & seen, likelihood, 0.0), ok, entropy)
 
-    def _seen(self, state: GridState, measurement: Any, valid: Bool[Array, "*m"]) -> Bool[Array, " m"]:
-        """Which directions of the measurement count, as seen from the first cell."""
+    def _mask(self, state: GridState, measurement: Any, valid: Bool[Array, "*m"]) -> Bool[Array, " m"]:
+        """Mask of the valid directions of the measurement, at the first cell."""
         first = jax.tree.map(lambda leaf: leaf[0], state.cells.points)
         return innovation(self.sensor.expect(first, measurement), measurement, valid)[1]
 
@@ -154,7 +154,7 @@ def box(lower: tuple[float, ...], upper: tuple[float, ...], shape: tuple[int, ..
     Args:
         lower: corner.
         upper: the opposite corner.
-        shape: cells along each axis.
+        shape: number of cells along each axis.
         dtype: of the points.
 
     Returns:
@@ -184,12 +184,12 @@ def box(lower: tuple[float, ...], upper: tuple[float, ...], shape: tuple[int, ..
 def plane(
     lower: tuple[float, float], upper: tuple[float, float], shape: tuple[int, int, int], dtype: Any = float
 ) -> Cells:
-    """Cells of planar poses: a box of positions, with all headings.
+    """Cells of planar poses: a rectangle of positions, with all headings.
 
     Args:
         lower: corner, m.
         upper: the opposite corner, m.
-        shape: cells along x, along y, and around.
+        shape: number of cells along x, y and heading.
         dtype: of the poses.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The Kalman filter in information form: it can begin from knowing nothing at all."""
+"""Square-root information filter: the Kalman filter in information form, for priors without information."""
 
 import math
 from typing import Any
@@ -7,21 +7,22 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, Motion, Sensor
 from jaxloc.beliefs.models import innovation
 from jaxloc.beliefs.square_root import cholesky, solve, triangularize, whiten
 from jaxloc.filters.interface import Filter, FilterState, GaussianState, Info
-from jaxloc.filters.kalman import finite_or_zero, noise_root, select
+from jaxloc.filters.kalman import noise_root
 
 
 class InformationState(FilterState):
-    """Equations ``L^T x = b + e`` with unit noise e: what is known of a vector, which may be nothing.
+    """State of the information filter: equations ``L^T x = b + e`` of a vector x with unit noise e.
 
     Attributes:
         information_sqrt: lower triangular L; ``L L^T`` is the information matrix.
         target: b.
-        step: how many predictions led here.
+        step: number of predictions so far.
     """
 
     information_sqrt: Float[Array, "d d"]
@@ -35,29 +36,29 @@ class InformationState(FilterState):
 
     @property
     def determined(self) -> Bool[Array, ""]:
-        """Whether every direction is known, so that there is a mean and a covariance."""
+        """Whether the information matrix has full rank, so that there is a mean and a covariance."""
         return jnp.all(_known(self.information_sqrt))
 
     @property
     def mean(self) -> Float[Array, " d"]:
-        """The most probable vector; zero along directions that nothing is known of."""
+        """Mean of the vector; zero along directions without information."""
         return _back(self.information_sqrt, self.target)
 
     def gaussian(self) -> Gaussian:
-        """The state as a density; its covariance means something only where `determined`."""
+        """The state as a density; its covariance is meaningful only where `determined`."""
         root = _inverse(self.information_sqrt)
         return Gaussian(self.mean, matmul(root.T, root))
 
 
 class InformationInfo(Info):
-    """What an update in information form says.
+    """Diagnostics of an update of the information filter.
 
     Attributes:
-        log_likelihood: of the measurement given all earlier ones; zero while the state is not determined, for what is
-            unknown has no density.
+        log_likelihood: of the measurement given all earlier ones; zero while the state is not determined, since
+            it then has no density.
         ok: whether the state can be used.
-        nis: squared misfit of the measurement with what was known; chi-square with `dof` degrees of freedom.
-        dof: number of valid directions, less those that determined something unknown.
+        nis: normalized innovation squared, chi-square with `dof` degrees of freedom.
+        dof: number of valid directions, less those that increased the rank of the information matrix.
     """
 
     log_likelihood: Float[Array, ""]
@@ -67,13 +68,13 @@ class InformationInfo(Info):
 
 
 class InformationFilter(Filter):
-    """The square-root information filter of linear models; the same numbers as `KalmanFilter`, and an exact zero start.
+    """The square-root information filter of linear models; equal to `KalmanFilter`, but allows zero prior information.
 
-    Predictions and updates stack whitened equations and triangularize them. Nothing is inverted but the transition.
+    Predictions and updates stack whitened equations and triangularize them. Only the transition matrix is inverted.
 
     Args:
-        motion: how a vector moves; linear, with a transition matrix that can be inverted.
-        sensor: what is measured; linear.
+        motion: linear motion of a vector, with an invertible transition matrix.
+        sensor: linear sensor.
 
     References:
         Bierman, *Factorization Methods for Discrete Sequential Estimation*, 1977, chapters V and VI; Thesis 2.4.1
@@ -83,7 +84,8 @@ class InformationFilter(Filter):
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> eye = jnp.eye(2)
         >>> filt = jl.filters.InformationFilter(jl.filters.LinearMotion(eye, eye), jl.filters.LinearSensor(eye, eye))
-        >>> state, info = filt.update(filt.predict(filt.nothing(2), None), jnp.array([3.0, 4.0]), jnp.array(True))
+        >>> state = filt.predict(filt.init_uninformative(2), None)
+        >>> state, info = filt.update(state, jnp.array([3.0, 4.0]), jnp.array(True))
         >>> [round(float(number), 3) for number in state.mean], bool(state.determined), float(info.nis)
         ([3.0, 4.0], True, 0.0)
     """
@@ -92,24 +94,24 @@ class InformationFilter(Filter):
     sensor: Sensor
 
     def init(self, prior: Gaussian | GaussianState) -> InformationState:
-        """The state of a prior density of a vector."""
+        """The initial state of a prior density of a vector."""
         root = cholesky(prior.covariance)
         # S^-1 is lower triangular; the equations S^-1 x = S^-1 m are brought to triangular form.
         inverse = _inverse(root)
         return _reduce(inverse, matmul(inverse, prior.mean), jnp.zeros((), jnp.int32))[0]
 
-    def nothing(self, size: int, dtype: Any = float) -> InformationState:
-        """The state of knowing nothing of a vector."""
+    def init_uninformative(self, size: int, dtype: Any = float) -> InformationState:
+        """The initial state of a vector without any prior information."""
         return InformationState(jnp.zeros((size, size), dtype), jnp.zeros(size, dtype), jnp.zeros((), jnp.int32))
 
     def predict(self, state: InformationState, control: Any, *, key: Key[Array, ""] | None = None) -> InformationState:
-        """The state one step later; entries of the control that are not finite count as zero."""
+        """The state one step ahead; non-finite entries of the control count as zero."""
         del key
-        control, mean = finite_or_zero(control), state.mean
+        control, mean = tree.finite_or_zero(control), state.mean
         moved, transition = self.motion.linearize(mean, control)
         noise = cholesky(self.motion.covariance(mean, control))
         size = mean.shape[0]
-        # With x = F^-1 (x' - shift - noise w): equations in (w, x'), of which w is taken out.
+        # With x = F^-1 (x' - shift - noise w): equations in (w, x'), of which w is eliminated.
         shift = moved - matmul(transition, mean)
         rows = jnp.linalg.solve(transition.T, state.information_sqrt).T
         eye, zero = jnp.eye(size, dtype=mean.dtype), jnp.zeros((size, size), mean.dtype)
@@ -118,12 +120,14 @@ class InformationFilter(Filter):
         root = triangularize(jnp.concatenate([left, right[:, None]], axis=1).T)
         block = slice(size, 2 * size)
         after = InformationState(root[block, block], root[2 * size, block], state.step + 1)
-        return select(_finite(after), after, InformationState(state.information_sqrt, state.target, state.step + 1))
+        return tree.where(
+            tree.all_finite(after), after, InformationState(state.information_sqrt, state.target, state.step + 1)
+        )
 
     def update(
         self, state: InformationState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[InformationState, InformationInfo]:
-        """The state given a measurement."""
+        """The state updated by a measurement."""
         del key
         mean = state.mean
         expected, matrix = self.sensor.linearize(mean, measurement)
@@ -136,9 +140,9 @@ class InformationFilter(Filter):
         matrix, target = jnp.where(usable, matrix, 0.0), jnp.where(usable, target, 0.0)
         rows = jnp.concatenate([state.information_sqrt.T, matrix])
         after, misfit = _reduce(rows, jnp.concatenate([state.target, target]), state.step)
-        ok = usable & _finite(after)
+        ok = usable & tree.all_finite(after)
         info = self._info(state, after, misfit, noise, jnp.sum(mask), ok)
-        return select(ok & jnp.any(mask), after, state), info
+        return tree.where(ok & jnp.any(mask), after, state), info
 
     def _info(
         self, before: InformationState, after: InformationState, misfit: Array, noise: Array, seen: Array, ok: Array
@@ -153,26 +157,26 @@ class InformationFilter(Filter):
 
 
 def _reduce(rows: Float[Array, "k d"], target: Float[Array, " k"], step: Array) -> tuple[InformationState, Array]:
-    """Equations ``rows x = target`` in triangular form, and the length of what no x can explain."""
+    """Equations ``rows x = target`` in triangular form, and the norm of their residual."""
     size = rows.shape[1]
     root = triangularize(jnp.concatenate([rows, target[:, None]], axis=1).T)
     return InformationState(root[:size, :size], root[size, :size], step), root[size, size]
 
 
 def _known(root: Float[Array, "d d"]) -> Bool[Array, " d"]:
-    """Which pivots are more than rounding."""
+    """Which pivots are above rounding level."""
     floor = 8.0 * float(jnp.finfo(root.dtype).eps) * jnp.sqrt(jnp.sum(lax.stop_gradient(root) ** 2, axis=1))
     return jnp.diagonal(root) > floor
 
 
 def _safe(root: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """A root in which directions that are not known are cut loose."""
+    """A root with unit, uncorrelated pivots in directions without information."""
     known = _known(root)
     return jnp.where(known[:, None] & known[None, :], root, jnp.eye(root.shape[0], dtype=root.dtype))
 
 
 def _back(root: Float[Array, "d d"], target: Float[Array, " d"]) -> Float[Array, " d"]:
-    """Solves ``L^T x = b``; zero along what is not known."""
+    """Solves ``L^T x = b``; zero along directions without information."""
     safe = _safe(root)
     wanted = jnp.where(_known(root), target, 0.0)
     return solve(safe, matmul(safe, wanted))
@@ -185,7 +189,3 @@ def _inverse(root: Float[Array, "d d"]) -> Float[Array, "d d"]:
 
 def _log_volume(root: Float[Array, "d d"]) -> Float[Array, ""]:
     return jnp.sum(jnp.log(jnp.where(_known(root), jnp.diagonal(root), 1.0)))
-
-
-def _finite(state: InformationState) -> Bool[Array, ""]:
-    return jnp.isfinite(lax.stop_gradient(jnp.sum(state.information_sqrt) + jnp.sum(state.target)))

@@ -1,4 +1,4 @@
-"""Things that change how they move: a bank of filters, one for each mode of motion, that interact."""
+"""Interacting multiple model (IMM) filter and smoother: a bank of filters, one for each mode of motion."""
 
 from typing import Any
 
@@ -8,22 +8,23 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
 from jaxloc.beliefs import Gaussian
 from jaxloc.beliefs.square_root import cholesky, product, triangularize, whiten
 from jaxloc.filters.interface import Filter, FilterState, GaussianInfo, GaussianState, History, Info
-from jaxloc.filters.kalman import GaussianFilter, finite_or_zero, recenter, select
-from jaxloc.filters.smoothers import Step, regress, smooth_step
+from jaxloc.filters.kalman import GaussianFilter, retract_root
+from jaxloc.filters.smoothers import ReverseStep, regression, smooth_step
 from jaxloc.filters.unscented import intrinsic_mean
 from jaxloc.poses import carry, is_flat, local
 
 
 class ModesState(FilterState):
-    """A state in each mode, and how probable the modes are.
+    """State of the IMM filter: a density for each mode, and the mode probabilities.
 
     Attributes:
-        states: one `GaussianState` a mode, stacked along a leading axis.
+        states: one `GaussianState` per mode, stacked along a leading axis.
         log_probabilities: of the modes.
-        step: how many predictions led here.
+        step: number of predictions so far.
     """
 
     states: GaussianState
@@ -32,26 +33,26 @@ class ModesState(FilterState):
 
     @property
     def probabilities(self) -> Float[Array, "*s k"]:
-        """Of the modes; they add up to one."""
+        """Mode probabilities; they sum to one."""
         return jnp.exp(self.log_probabilities)
 
     def combined(self) -> GaussianState:
-        """One normal density with the moments of all modes together."""
+        """The normal density with the moments of the mixture of all modes."""
         return mix(self.states, self.probabilities)
 
     def gaussian(self) -> Gaussian:
-        """The same as a `Gaussian`."""
+        """The combined density as a `Gaussian`."""
         return self.combined().gaussian()
 
 
 class ModesInfo(Info):
-    """What an update of a bank of filters says.
+    """Diagnostics of an update of the IMM filter.
 
     Attributes:
         log_likelihood: of the measurement given all earlier ones; zero where there is none.
         ok: whether the state can be used.
         probabilities: of the modes, after the update.
-        modes: what the filter of each mode says, stacked along a leading axis.
+        modes: info of the filter of each mode, stacked along a leading axis.
     """
 
     log_likelihood: Float[Array, ""]
@@ -61,15 +62,15 @@ class ModesInfo(Info):
 
 
 class InteractingFilters(Filter):
-    """The interacting multiple model (IMM) filter: one filter of the Kalman family a mode, mixed before each step.
+    """The interacting multiple model (IMM) filter: one filter of the Kalman family per mode, mixed before each step.
 
     The mode is a Markov chain, ``p(s' = j | s = i) = transition[i, j]``. A prediction mixes the states of all modes for
-    each mode, by the probability that it was reached from them, and moves them by the filter of that mode; an update
-    weighs modes by the likelihood of the measurement.
+    each mode, by the probability of the transition, and predicts the mixture by the filter of that mode; an update
+    weights modes by the likelihood of the measurement.
 
     Args:
         filters: one for each mode, all on the same state; of any kind (linear, extended, sigma-point).
-        transition: mode transition matrix "k k", rows that add up to one; may be learned.
+        transition: mode transition matrix "k k", rows sum to one; may be learned.
 
     Raises:
         ValueError: if the transition matrix does not fit the number of filters.
@@ -81,8 +82,8 @@ class InteractingFilters(Filter):
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> sensor = jl.filters.LinearSensor(jnp.eye(1, 2), 0.01 * jnp.eye(1))
-        >>> calm, wild = (jl.filters.KalmanFilter(jl.filters.ConstantVelocity(q, axes=1), sensor) for q in (1e-4, 10.0))
-        >>> filt = jl.filters.InteractingFilters((calm, wild), jnp.array([[0.9, 0.1], [0.1, 0.9]]))
+        >>> modes = [jl.filters.KalmanFilter(jl.filters.ConstantVelocity(q, axes=1), sensor) for q in (1e-4, 10.0)]
+        >>> filt = jl.filters.InteractingFilters(tuple(modes), jnp.array([[0.9, 0.1], [0.1, 0.9]]))
         >>> state = filt.init(jl.beliefs.Gaussian(jnp.zeros(2), 0.01 * jnp.eye(2)))
         >>> state, info = filt.update(filt.predict(state, jnp.array(1.0)), jnp.array([2.0]), jnp.array(True))
         >>> bool(info.probabilities[1] > 0.9)
@@ -103,7 +104,7 @@ class InteractingFilters(Filter):
         """The state of a prior density.
 
         Args:
-            prior: of the state in every mode.
+            prior: of the state, the same in every mode.
             probabilities: of the modes; None for equal ones.
         """
         count = len(self.filters)
@@ -113,7 +114,7 @@ class InteractingFilters(Filter):
         return ModesState(states, log_probability(probabilities), jnp.zeros((), jnp.int32))
 
     def predict(self, state: ModesState, control: Any, *, key: Key[Array, ""] | None = None) -> ModesState:
-        """The state one step later: mixed for each mode, then moved by its filter."""
+        """The state one step ahead: mixed for each mode, then predicted by its filter."""
         del key
         joint = state.log_probabilities[:, None] + log_probability(self.transition)
         predicted = jax.nn.logsumexp(joint, axis=0)
@@ -125,7 +126,7 @@ class InteractingFilters(Filter):
     def update(
         self, state: ModesState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[ModesState, ModesInfo]:
-        """The state given a measurement."""
+        """The state updated by a measurement."""
         del key
         pairs = [
             filt.update(one, measurement, valid) for filt, one in zip(self.filters, unstack(state.states), strict=True)
@@ -145,9 +146,9 @@ def smooth_modes(
 ) -> ModesState:
     """Modes and states of a run given all its measurements: the IMM smoother.
 
-    Going back a step, what later measurements say of the state after it is taken for each mode as the ratio of its
-    smoothed and its predicted density. Each pair of modes (before, after) is smoothed with that; pairs are weighed by
-    the transition matrix and by how well their prediction fits, and those with the same mode before are merged.
+    In each backward step, the likelihood of later measurements is, for each mode, the ratio of the smoothed and the
+    predicted density. Each pair of modes (before, after) is smoothed with it; pairs are weighted by the transition
+    matrix and the likelihood of their prediction, and pairs with the same mode before are merged.
 
     Args:
         filt: the filter of the run.
@@ -166,8 +167,8 @@ def smooth_modes(
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> sensor = jl.filters.LinearSensor(jnp.eye(1, 2), 0.01 * jnp.eye(1))
-        >>> calm, wild = (jl.filters.KalmanFilter(jl.filters.ConstantVelocity(q, axes=1), sensor) for q in (1e-4, 10.0))
-        >>> filt = jl.filters.InteractingFilters((calm, wild), jnp.array([[0.9, 0.1], [0.1, 0.9]]))
+        >>> modes = [jl.filters.KalmanFilter(jl.filters.ConstantVelocity(q, axes=1), sensor) for q in (1e-4, 10.0)]
+        >>> filt = jl.filters.InteractingFilters(tuple(modes), jnp.array([[0.9, 0.1], [0.1, 0.9]]))
         >>> start = filt.init(jl.beliefs.Gaussian(jnp.zeros(2), 0.01 * jnp.eye(2)))
         >>> dt, z = jnp.ones(4), jnp.array([[0.0], [0.0], [2.0], [4.0]])
         >>> _, history = jl.filters.run(filt, start, dt, z, jnp.ones(4, bool))
@@ -175,16 +176,16 @@ def smooth_modes(
         (4, 2)
     """
     states = history.states
-    there = jnp.ones(states.step.shape[:1], bool) if active is None else active
+    mask = jnp.ones(states.step.shape[:1], bool) if active is None else active
     last = jax.tree.map(lambda leaf: leaf[-1], states)
     before = jax.tree.map(lambda leaf: leaf[:-1], states)
-    after = jax.tree.map(lambda leaf: leaf[1:], (finite_or_zero(controls), there))
+    after = jax.tree.map(lambda leaf: leaf[1:], (tree.finite_or_zero(controls), mask))
 
     def back(smoothed, inputs):
         state, (control, here) = inputs
         earlier = _smooth_back(filt, state, control, smoothed)
         held = ModesState(_renumber(smoothed.states, state.step), smoothed.log_probabilities, state.step)
-        earlier = select(here, earlier, held)
+        earlier = tree.where(here, earlier, held)
         return earlier, earlier
 
     _, smoothed = lax.scan(back, last, (before, after), reverse=True)
@@ -195,14 +196,14 @@ def _smooth_back(filt: InteractingFilters, state: ModesState, control: Any, smoo
     """One step back of the smoother, over all pairs (mode before, mode after)."""
     predicted, pairs, scores = filt.predict(state, control), [], []
     for mode, expected, after in zip(filt.filters, unstack(predicted.states), unstack(smoothed.states), strict=True):
-        evidence = gather(expected, after)
+        evidence = density_ratio(expected, after)
 
         def pair(before, mode=mode, evidence=evidence):
-            spread = mode.move(before, control)
-            root, size = spread.root(), spread.image.shape[0]
-            moved = GaussianState(spread.mean, root[:size, :size], before.step)
-            revised, score = revise(moved, evidence)
-            return smooth_step(before, Step(spread.mean, *regress(root)), revised), score
+            joint = mode.predict_joint(before, control)
+            root, size = joint.root(), joint.output.shape[0]
+            moved = GaussianState(joint.mean, root[:size, :size], before.step)
+            revised, score = multiply(moved, evidence)
+            return smooth_step(before, ReverseStep(joint.mean, *regression(root)), revised), score
 
         earlier, score = jax.vmap(pair)(state.states)
         pairs.append(earlier)
@@ -217,11 +218,11 @@ def _smooth_back(filt: InteractingFilters, state: ModesState, control: Any, smoo
 
 
 class Evidence(eqx.Module):
-    """What later measurements say of a state: in sigmas y of its prediction, ``log p = score y - |root^T y|^2 / 2``.
+    """Likelihood of later measurements: ``log p = score y - |root^T y|^2 / 2`` in the whitened state y.
 
     Attributes:
         center: mean and root of the prediction, which define y.
-        free: directions in which the prediction is uncertain.
+        free: directions of nonzero predicted variance.
         score, root: of the log likelihood.
     """
 
@@ -231,41 +232,41 @@ class Evidence(eqx.Module):
     root: Float[Array, "d d"]
 
 
-def gather(predicted: GaussianState, smoothed: GaussianState) -> Evidence:
-    """What turned a prediction into the smoothed state: the ratio of both densities."""
+def density_ratio(predicted: GaussianState, smoothed: GaussianState) -> Evidence:
+    """The ratio of the smoothed and the predicted density."""
     root = predicted.covariance_sqrt
     info, scale = jnp.finfo(root.dtype), jnp.sqrt(jnp.sum(lax.stop_gradient(root) ** 2, axis=1))
-    # Directions that are known without noise (an acceleration held at zero) carry no evidence.
+    # Directions of zero variance (an acceleration held at zero) carry no information.
     free = jnp.diagonal(root) > jnp.maximum(8.0 * float(info.eps) * scale, float(info.tiny) ** 0.25)
-    center = GaussianState(predicted.mean, _pinned(root, free), predicted.step)
-    shift, spread = _in_sigmas(center, free, smoothed)
+    center = GaussianState(predicted.mean, _regularized(root, free), predicted.step)
+    shift, white = _whitened(center, free, smoothed)
     eye = jnp.eye(shift.shape[0], dtype=root.dtype)
-    inverse = whiten(_pinned(triangularize(spread), free), eye)
+    inverse = whiten(_regularized(triangularize(white), free), eye)
     gained = product(inverse.T, inverse)
     return Evidence(center, free, product(gained, shift), cholesky(gained - eye))
 
 
-def revise(state: GaussianState, evidence: Evidence) -> tuple[GaussianState, Float[Array, ""]]:
-    """A density times a likelihood of later measurements: the product, and the logarithm of its mass."""
+def multiply(state: GaussianState, evidence: Evidence) -> tuple[GaussianState, Float[Array, ""]]:
+    """The product of a density and a likelihood, normalized, and the logarithm of its mass."""
     center, known = evidence.center, evidence.root
-    shift, spread = _in_sigmas(center, evidence.free, state)
+    shift, white = _whitened(center, evidence.free, state)
     size = shift.shape[0]
-    seen = product(known.T, spread)
+    seen = product(known.T, white)
     scale = triangularize(jnp.concatenate([seen.T, jnp.eye(size, dtype=shift.dtype)], axis=1))
     slope = evidence.score - product(known, product(known.T, shift))
-    step = whiten(scale, product(spread.T, slope))
-    root = whiten(scale, spread.T).T
+    step = whiten(scale, product(white.T, slope))
+    root = whiten(scale, white.T).T
     mass = jnp.sum(evidence.score * shift) - 0.5 * jnp.sum(product(known.T, shift) ** 2)
     mass = mass + 0.5 * jnp.sum(step**2) - jnp.sum(jnp.log(jnp.diagonal(scale)))
     delta = product(center.covariance_sqrt, jnp.where(evidence.free, shift + product(root, step), 0.0))
-    mean, root = recenter(center.mean, delta, triangularize(product(center.covariance_sqrt, root)))
+    mean, root = retract_root(center.mean, delta, triangularize(product(center.covariance_sqrt, root)))
     return GaussianState(mean, root, state.step), mass
 
 
-def _in_sigmas(
+def _whitened(
     center: GaussianState, free: Bool[Array, " d"], state: GaussianState
 ) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
-    """Mean and root of a state in the sigmas of another."""
+    """Mean and root of a state, whitened by the covariance of another."""
     shift, root = local(center.mean, state.mean), state.covariance_sqrt
     if not is_flat(center.mean):
         root = product(carry(state.mean, jnp.zeros_like(shift), center.mean), root)
@@ -274,17 +275,17 @@ def _in_sigmas(
     return white[:, 0], white[:, 1:]
 
 
-def _pinned(root: Float[Array, "d d"], free: Bool[Array, " d"]) -> Float[Array, "d d"]:
-    """A root that can be divided by: directions that are not free are cut loose, at one sigma."""
+def _regularized(root: Float[Array, "d d"], free: Bool[Array, " d"]) -> Float[Array, "d d"]:
+    """A root with unit, uncorrelated entries in the directions that are not free, so that it can be inverted."""
     return jnp.where(free[:, None] & free[None, :], root, jnp.eye(free.shape[0], dtype=root.dtype))
 
 
 def mix(states: GaussianState, weights: Float[Array, " k"]) -> GaussianState:
-    """One normal density with the mean and covariance of a mixture.
+    """The normal density with the mean and covariance of a mixture.
 
     Args:
         states: stacked along a leading axis.
-        weights: that add up to one.
+        weights: they sum to one.
 
     Returns:
         The state, with an intrinsic mean on manifolds.
@@ -302,7 +303,7 @@ def mix(states: GaussianState, weights: Float[Array, " k"]) -> GaussianState:
 
 
 def log_probability(probabilities: Float[Array, "*k"]) -> Float[Array, "*k"]:
-    """The logarithm, with impossible events at a finite bound."""
+    """Logarithm of probabilities, finite at zero."""
     return jnp.log(jnp.maximum(probabilities, float(jnp.finfo(probabilities.dtype).tiny)))
 
 

@@ -1,4 +1,4 @@
-"""The four verbs of every filter: init, predict, update, run."""
+"""Interface of filters: init, predict and update, and `run` over a recording."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -16,22 +16,23 @@ from jaxloc.beliefs import Gaussian
 
 
 class FilterState(eqx.Module):
-    """What the next step of a filter needs; each kind of filter has its own.
+    """State of a filter: all that its next step depends on.
 
     Attributes:
-        step: how many predictions led here; it numbers the random keys, so that a resumed run draws as one pass does.
+        step: number of predictions so far; random keys are derived from it, so that a resumed run draws the same
+            numbers as one pass.
     """
 
     step: eqx.AbstractVar[Int[Array, ""]]
 
 
 class GaussianState(FilterState):
-    """A normal density in square-root form: what the Kalman family carries.
+    """State of the Kalman family: a normal density in square-root form.
 
     Attributes:
         mean: a vector, a pose, or any pytree of them.
         covariance_sqrt: lower triangular root of the covariance in the tangent space of the mean.
-        step: how many predictions led here.
+        step: number of predictions so far.
     """
 
     mean: Any
@@ -40,7 +41,7 @@ class GaussianState(FilterState):
 
     @property
     def covariance(self) -> Float[Array, "*s d d"]:
-        """Of the tangent at the mean; symmetric and never negative, being a product of the root with itself."""
+        """Covariance of the tangent at the mean; positive semidefinite, as the product of the root with itself."""
         return matmul(self.covariance_sqrt, self.covariance_sqrt.mT)
 
     def gaussian(self) -> Gaussian:
@@ -49,11 +50,11 @@ class GaussianState(FilterState):
 
 
 class Info(eqx.Module):
-    """What people want to know of one update.
+    """Diagnostics of an update.
 
     Attributes:
         log_likelihood: of the measurement given all earlier ones; zero where there is none.
-        ok: whether the state can be used; False after bad numbers, where the state is the predicted one.
+        ok: whether the state can be used; False for non-finite input, where the state is the predicted one.
     """
 
     log_likelihood: eqx.AbstractVar[Float[Array, ""]]
@@ -61,15 +62,15 @@ class Info(eqx.Module):
 
 
 class GaussianInfo(Info):
-    """What an update of the Kalman family says.
+    """Diagnostics of an update of the Kalman family.
 
     Attributes:
         log_likelihood: of the measurement given all earlier ones; zero where there is none.
         ok: whether the state can be used.
-        innovation: measured minus expected, in the tangent space of the measurement, zero where masked.
+        innovation: measured minus predicted, in the tangent space of the measurement, zero where masked.
         innovation_covariance: its predicted covariance; unit variance where masked.
-        nis: normalized innovation squared, chi-square with `dof` degrees of freedom when the model is right.
-        dof: number of valid directions.
+        nis: normalized innovation squared, chi-square with `dof` degrees of freedom under the model.
+        dof: number of degrees of freedom: of valid directions.
         accepted: whether the measurement passed the gate (True without one).
     """
 
@@ -83,25 +84,25 @@ class GaussianInfo(Info):
 
 
 class Filter(eqx.Module):
-    """A recursive estimator: a pytree of its models, with three pure verbs; `run` is the fourth."""
+    """A recursive estimator: a pytree of its models, with pure functions `init`, `predict` and `update`."""
 
     @abstractmethod
     def init(self, prior: Any) -> Any:
-        """The state before any data, from a prior such as a `Gaussian`."""
+        """The initial state, from a prior such as a `Gaussian`."""
 
     @abstractmethod
     def predict(self, state: Any, control: Any, *, key: Key[Array, ""] | None = None) -> Any:
-        """The state one step later, before its measurement."""
+        """The state one step ahead, before its measurement."""
 
     @abstractmethod
     def update(
         self, state: Any, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[Any, Any]:
-        """The state given a measurement, and an `Info`; nothing changes where the measurement is not valid."""
+        """The state updated by a measurement, and an `Info`; unchanged where the measurement is not valid."""
 
 
 class History(eqx.Module):
-    """A run step by step, stacked along a leading axis.
+    """States and infos of a run, stacked along the steps.
 
     Attributes:
         states: after each update (or what `keep` made of them).
@@ -112,7 +113,7 @@ class History(eqx.Module):
     infos: Any
 
 
-def _whole(state: Any) -> Any:
+def _identity(state: Any) -> Any:
     return state
 
 
@@ -125,22 +126,22 @@ def run(
     valid: Bool[Array, "t *m"],
     *,
     active: Bool[Array, " t"] | None = None,
-    keep: Callable[[Any], Any] = _whole,
+    keep: Callable[[Any], Any] = _identity,
     key: Key[Array, ""] | None = None,
 ) -> tuple[Any, History]:
     """A pass over a recording: for each step `predict`, then `update`, in one scan.
 
     Args:
         filt: any `Filter`.
-        state: where to begin, `filt.init(prior)` or the state that an earlier run ended in. A resumed run continues to
-            the same numbers as one pass.
-        controls: stacked along the steps, such as the ``dt`` of each; or None.
+        state: the initial state, `filt.init(prior)` or the last state of an earlier run. A resumed run gives the same
+            numbers as one pass.
+        controls: stacked along the steps, such as ``dt``; or None.
         measurements: stacked along the steps.
-        valid: which measurements there are: one truth value a step, or one for each tangent direction of each.
-        active: which steps there are. A step that is not leaves the state as it was, so that padded sequences of any
-            length share one program. None for all.
-        keep: what of each state the history holds, such as an estimate instead of all particles.
-        key: random key of filters that draw.
+        valid: mask of the measurements: one Boolean per step, or one for each tangent direction of each.
+        active: mask of the steps. An inactive step leaves the state unchanged, so that padded sequences of different
+            lengths share one compiled program. None for all.
+        keep: function of each state whose results the history holds, such as an estimate instead of all particles.
+        key: random key, for filters that sample.
 
     Returns:
         The last state, and the `History`.
@@ -154,7 +155,7 @@ def run(
         >>> history.infos.log_likelihood.shape
         (5,)
     """
-    there = jnp.ones(valid.shape[:1], bool) if active is None else active
+    mask = jnp.ones(valid.shape[:1], bool) if active is None else active
 
     def advance(before, inputs):
         control, measurement, valid_here, here = inputs
@@ -165,4 +166,4 @@ def run(
             after = tree.where(here, after, before)
         return after, History(keep(after), info)
 
-    return lax.scan(advance, state, (controls, measurements, valid, there))
+    return lax.scan(advance, state, (controls, measurements, valid, mask))

@@ -1,8 +1,9 @@
-"""The Kalman filter in square-root form, and the parts that the whole family shares.
+"""Kalman filter in square-root form, and the parts that the whole family shares.
 
-Every member says how a normal density spreads through its models, as scaled deviations side by side (`Spread`); one
-orthogonal factorization of these gives the prediction, and one more the update. No covariance is ever formed, so none
-can lose its positive definiteness, in float32 and with priors a hundred thousand sigmas wide.
+Every filter of the family gives the joint covariance of a model's output with the state, as scaled deviations side by
+side (`JointCovariance`); one orthogonal factorization of these gives the prediction, and one more the update. No
+covariance is ever formed, so none can lose its positive definiteness, in float32 and with priors of a standard
+deviation 1e5 times that of the measurements.
 """
 
 import math
@@ -59,87 +60,89 @@ class LinearSensor(Sensor):
         return self.expect(state, measurement), self.matrix
 
 
-class Spread(eqx.Module):
-    """How a normal density and its image under a function vary together.
+class JointCovariance(eqx.Module):
+    """Joint covariance of the state and the output of a model, as a matrix of scaled deviations.
 
-    The covariance of (image, source) is ``A A^T`` with ``A = [image; source]``, less ``c c^T`` where there is one
+    The covariance of (output, input) is ``A A^T`` with ``A = [output; input]``, less ``c c^T`` where there is one
     (sigma points whose central weight is negative).
 
     Attributes:
-        mean: of the image.
-        image: scaled deviations of the image, side by side; the noise's root is among them.
-        source: those of the source in the same columns.
-        removed: c, of the image and the source, or None.
+        mean: of the output.
+        output: scaled deviations of the output, side by side, the root of the noise included.
+        input: those of the state, in the same columns.
+        removed: c, of the output and the input, or None.
     """
 
     mean: Any
-    image: Float[Array, "m k"]
-    source: Float[Array, "d k"]
+    output: Float[Array, "m k"]
+    input: Float[Array, "d k"]
     removed: Float[Array, " n"] | None = None
 
     def root(self) -> Float[Array, "n n"]:
-        """Lower triangular root of the covariance of (image, source), n = m + d."""
-        both = triangularize(jnp.concatenate([self.image, self.source]))
+        """Lower triangular root of the covariance of (output, input), n = m + d."""
+        both = triangularize(jnp.concatenate([self.output, self.input]))
         return both if self.removed is None else downdate(both, self.removed)
 
-    def image_root(self) -> Float[Array, "m m"]:
-        """Lower triangular root of the covariance of the image alone."""
-        size = self.image.shape[0]
-        root = triangularize(self.image)
+    def output_root(self) -> Float[Array, "m m"]:
+        """Lower triangular root of the covariance of the output alone."""
+        size = self.output.shape[0]
+        root = triangularize(self.output)
         return root if self.removed is None else downdate(root, self.removed[:size])
 
 
-class Reading(eqx.Module):
-    """A measurement beside what was expected.
+class Innovation(eqx.Module):
+    """Difference of a measurement and its prediction, with their joint covariance.
 
     Attributes:
-        spread: of the expected measurement with the state.
-        residual: measured minus expected, zero where masked.
-        mask: which directions count.
+        joint: of the predicted measurement and the state.
+        residual: measured minus predicted, zero where masked.
+        mask: which directions are valid.
     """
 
-    spread: Spread
+    joint: JointCovariance
     residual: Float[Array, " m"]
     mask: Bool[Array, " m"]
 
 
 class GaussianFilter(Filter):
-    """What every member of the Kalman family is: two spreads; predictions and updates follow from them.
+    """Interface of the Kalman family: two joint covariances, from which predictions and updates follow.
 
     Attributes:
-        gate: probability that a right measurement passes the chi-square gate; one that does not leaves the state as it
-            was, and counts nothing in the likelihood. None for no gate.
+        gate: probability that a measurement from the model passes the chi-square gate; one that does not leaves the
+            state unchanged and does not enter the likelihood. None for no gate.
     """
 
     gate: eqx.AbstractVar[float | None]
 
     @abstractmethod
-    def move(self, state: GaussianState, control: Any) -> Spread:
-        """How the state after a step varies with the state before it, noise included."""
+    def predict_joint(self, state: GaussianState, control: Any) -> JointCovariance:
+        """Joint covariance of the next state and the state, process noise included."""
 
     @abstractmethod
-    def read(self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]) -> Reading:
-        """The measurement beside the expected one, and how that varies with the state."""
+    def innovation(self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]) -> Innovation:
+        """The innovation of a measurement, with the joint covariance of its prediction and the state."""
 
     def init(self, prior: Gaussian) -> GaussianState:
         """The state of a prior density."""
         return GaussianState(prior.mean, cholesky(prior.covariance), jnp.zeros((), jnp.int32))
 
     def predict(self, state: GaussianState, control: Any, *, key: Key[Array, ""] | None = None) -> GaussianState:
-        """The state one step later; entries of the control that are not finite count as zero."""
+        """The state one step ahead; non-finite entries of the control count as zero."""
         del key
-        spread = self.move(state, finite_or_zero(control))
-        moved = GaussianState(spread.mean, spread.image_root(), state.step + 1)
-        return select(_is_finite(moved), moved, GaussianState(state.mean, state.covariance_sqrt, state.step + 1))
+        joint = self.predict_joint(state, tree.finite_or_zero(control))
+        moved = GaussianState(joint.mean, joint.output_root(), state.step + 1)
+        return tree.where(
+            tree.all_finite(moved), moved, GaussianState(state.mean, state.covariance_sqrt, state.step + 1)
+        )
 
     def update(
         self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[GaussianState, GaussianInfo]:
-        """The state given a measurement."""
+        """The state updated by a measurement."""
         del key
-        reading = self.read(state, measurement, valid)
-        root = reading.spread.root()
-        info = judge(root, reading, self.gate)
+        found = self.innovation(state, measurement, valid)
+        root = found.joint.root()
+        info = innovation_info(root, found, self.gate)
         return correct(state, root, info), info
 
 
@@ -152,7 +155,7 @@ class KalmanFilter(GaussianFilter):
     Args:
         motion: how the state moves; `LinearMotion`, `ConstantVelocity`, or any `Motion` that is linear.
         sensor: what is measured; a `LinearSensor`, or any `Sensor` that is linear.
-        gate: probability that a right measurement passes; None for no gate.
+        gate: probability that a measurement from the model passes; None for no gate.
 
     References:
         Kalman 1960; Kaminski, Bryson and Schmidt, "Discrete square root filtering", IEEE TAC 1971 [T-56], [R-4].
@@ -171,94 +174,97 @@ class KalmanFilter(GaussianFilter):
     sensor: Sensor
     gate: float | None = eqx.field(static=True, default=None)
 
-    def move(self, state: GaussianState, control: Any) -> Spread:
+    def predict_joint(self, state: GaussianState, control: Any) -> JointCovariance:
         """By the transition matrix."""
-        return spread_motion(self.motion, state, control)
+        return linearized_motion(self.motion, state, control)
 
-    def read(self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]) -> Reading:
+    def innovation(self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]) -> Innovation:
         """By the measurement matrix."""
-        return read_linearized(self.sensor, state, measurement, valid)
+        return linearized_innovation(self.sensor, state, measurement, valid)
 
 
-def spread_motion(motion: Motion, state: GaussianState, control: Any) -> Spread:
-    """The spread of a motion, by its derivative."""
+def linearized_motion(motion: Motion, state: GaussianState, control: Any) -> JointCovariance:
+    """Joint covariance of the next state and the state, by the derivative of the motion."""
     mean, jacobian = motion.linearize(state.mean, control)
     noise = cholesky(motion.covariance(state.mean, control))
     carried = product(jacobian, state.covariance_sqrt)
-    source = jnp.concatenate([state.covariance_sqrt, jnp.zeros_like(noise)], axis=1)
-    return Spread(mean, jnp.concatenate([carried, noise], axis=1), source)
+    before = jnp.concatenate([state.covariance_sqrt, jnp.zeros_like(noise)], axis=1)
+    return JointCovariance(mean, jnp.concatenate([carried, noise], axis=1), before)
 
 
-def read_linearized(sensor: Sensor, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]) -> Reading:
-    """A measurement beside what the mean predicts, with the spread by the derivative."""
+def linearized_innovation(
+    sensor: Sensor, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]
+) -> Innovation:
+    """Innovation at the mean, with the joint covariance by the derivative of the sensor."""
     expected, jacobian = sensor.linearize(state.mean, measurement)
     residual, mask = innovation(expected, measurement, valid)
     mask = mask & jnp.all(jnp.isfinite(jacobian), axis=1)
     noise, mask = noise_root(sensor.covariance(state.mean, measurement), mask)
-    seen = product(jnp.where(mask[:, None], jacobian, 0.0), state.covariance_sqrt)
-    return Reading(spread_reading(expected, noise, seen, state), jnp.where(mask, residual, 0.0), mask)
+    deviations = product(jnp.where(mask[:, None], jacobian, 0.0), state.covariance_sqrt)
+    joint = measurement_joint(expected, noise, deviations, state)
+    return Innovation(joint, jnp.where(mask, residual, 0.0), mask)
 
 
-def spread_reading(
-    expected: Any, noise: Float[Array, "m m"], seen: Float[Array, "m d"], state: GaussianState
-) -> Spread:
-    """The spread of a measurement whose deviations ``H S`` are given."""
+def measurement_joint(
+    expected: Any, noise: Float[Array, "m m"], deviations: Float[Array, "m d"], state: GaussianState
+) -> JointCovariance:
+    """Joint covariance of a predicted measurement and the state, given its deviations ``H S``."""
     root = state.covariance_sqrt
-    source = jnp.concatenate([jnp.zeros((root.shape[0], noise.shape[0]), root.dtype), root], axis=1)
-    return Spread(expected, jnp.concatenate([noise, seen], axis=1), source)
+    before = jnp.concatenate([jnp.zeros((root.shape[0], noise.shape[0]), root.dtype), root], axis=1)
+    return JointCovariance(expected, jnp.concatenate([noise, deviations], axis=1), before)
 
 
 def noise_root(
     covariance: Float[Array, "m m"], mask: Bool[Array, " m"]
 ) -> tuple[Float[Array, "m m"], Bool[Array, " m"]]:
-    """Root of a measurement noise with masked directions cut loose; directions without a finite variance are masked."""
+    """Root of a measurement covariance, unit where masked; directions without a finite variance are masked."""
     mask = mask & jnp.isfinite(jnp.diagonal(covariance))
     return cholesky(mask_covariance(covariance, mask)), mask
 
 
-def judge(root: Float[Array, "n n"], reading: Reading, gate: float | None = None) -> GaussianInfo:
-    """What an innovation says: its likelihood, whether it is plausible, whether it can be used.
+def innovation_info(root: Float[Array, "n n"], found: Innovation, gate: float | None = None) -> GaussianInfo:
+    """Log likelihood, NIS and gate of an innovation.
 
     Args:
         root: of the covariance of (measurement, state).
-        reading: the measurement beside the expected one.
-        gate: probability that a right measurement passes; None lets all pass.
+        found: the innovation.
+        gate: probability that a measurement from the model passes; None for no gate.
     """
-    size, mask = reading.mask.shape[0], reading.mask
-    spread = regular(root[:size, :size])
-    trial = lax.stop_gradient(jnp.sum(whiten(spread, reading.residual) ** 2))
+    size, mask = found.mask.shape[0], found.mask
+    measured = without_zero_pivots(root[:size, :size])
+    trial = lax.stop_gradient(jnp.sum(whiten(measured, found.residual) ** 2))
     ok = jnp.isfinite(trial) & jnp.all(jnp.isfinite(lax.stop_gradient(root)))
-    # Numbers that overflow are taken out before they are used: their derivatives would be bad as well.
-    residual = jnp.where(ok, reading.residual, 0.0)
-    nis = jnp.sum(whiten(spread, residual) ** 2)
+    # Overflow is removed before it is used: its derivatives would be non-finite as well.
+    residual = jnp.where(ok, found.residual, 0.0)
+    nis = jnp.sum(whiten(measured, residual) ** 2)
     dof = jnp.sum(mask)
-    accepted = jnp.array(True) if gate is None else nis <= _gates(gate, size, nis.dtype)[dof]
+    accepted = jnp.array(True) if gate is None else nis <= _gate_bounds(gate, size, nis.dtype)[dof]
     used = ok & accepted & (dof > 0)
-    volume = jnp.sum(jnp.log(jnp.diagonal(spread)))
+    volume = jnp.sum(jnp.log(jnp.diagonal(measured)))
     likelihood = -0.5 * nis - volume - 0.5 * math.log(2.0 * math.pi) * dof.astype(nis.dtype)
-    covariance = product(spread, spread.T)
+    covariance = product(measured, measured.T)
     return GaussianInfo(jnp.where(used, likelihood, 0.0), ok, residual, covariance, nis, dof, accepted)
 
 
 def correct(state: GaussianState, root: Float[Array, "n n"], info: GaussianInfo) -> GaussianState:
-    """The state given the innovation, where there is one that can be used; else the state as it was."""
+    """The state updated by an innovation, where it is usable; else unchanged."""
     size = info.innovation.shape[0]
     gain, rest = root[size:, :size], root[size:, size:]
-    delta = product(gain, whiten(regular(root[:size, :size]), info.innovation))
-    return settle(state, delta, rest, info)
+    delta = product(gain, whiten(without_zero_pivots(root[:size, :size]), info.innovation))
+    return apply_correction(state, delta, rest, info)
 
 
-def settle(
+def apply_correction(
     state: GaussianState, delta: Float[Array, " d"], rest: Float[Array, "d d"], info: GaussianInfo
 ) -> GaussianState:
-    """Moves a state along a tangent, with its new root, where the info says that there is reason to."""
-    mean, rest = recenter(state.mean, delta, rest)
+    """Moves a state along a tangent and replaces its root, where the innovation is usable."""
+    mean, rest = retract_root(state.mean, delta, rest)
     moved = GaussianState(mean, rest, state.step)
-    return select(info.ok & info.accepted & (info.dof > 0) & _is_finite(moved), moved, state)
+    return tree.where(info.ok & info.accepted & (info.dof > 0) & tree.all_finite(moved), moved, state)
 
 
-def recenter(mean: Any, delta: Float[Array, " d"], root: Float[Array, "d d"]) -> tuple[Any, Float[Array, "d d"]]:
-    """A mean moved along a tangent, and the root there of a covariance that was given in the tangent space of the mean.
+def retract_root(mean: Any, delta: Float[Array, " d"], root: Float[Array, "d d"]) -> tuple[Any, Float[Array, "d d"]]:
+    """A mean moved along a tangent, and a covariance root transported from the old tangent space to the new one.
 
     To first order: the root is carried by the derivative between the two tangent spaces (for a pose its right
     Jacobian). Vectors have one tangent space only.
@@ -267,29 +273,14 @@ def recenter(mean: Any, delta: Float[Array, " d"], root: Float[Array, "d d"]) ->
     return moved, root if is_flat(mean) else triangularize(product(carry(mean, delta, moved), root))
 
 
-def select(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
-    """One of two pytrees, leaf by leaf."""
-    return tree.where(condition, new, old)
-
-
-def finite_or_zero(value: Any) -> Any:
-    """A pytree with zeros in place of numbers that are not finite."""
-    return jax.tree.map(lambda a: jnp.where(jnp.isfinite(a), a, 0.0) if eqx.is_inexact_array(a) else a, value)
-
-
-def _is_finite(state: GaussianState) -> Bool[Array, ""]:
-    leaves = [lax.stop_gradient(leaf) for leaf in jax.tree.leaves(state) if eqx.is_inexact_array(leaf)]
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
-
-
-def regular(root: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """A root whose pivots can be divided by: an exact zero (no noise, nothing uncertain) becomes one."""
+def without_zero_pivots(root: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """A root with every zero pivot (no noise and no uncertainty) replaced by one, so that it can be inverted."""
     zero = jnp.diagonal(root) <= 0.0
     return root + jnp.diag(zero.astype(root.dtype))
 
 
-def _gates(probability: float, size: int, dtype: Any) -> Float[Array, " n"]:
-    """Bounds of the NIS for each number of directions, worked out when the program is traced."""
+def _gate_bounds(probability: float, size: int, dtype: Any) -> Float[Array, " n"]:
+    """Bounds of the NIS for each number of valid directions, computed at trace time."""
     with jax.ensure_compile_time_eval():
         bounds = np.asarray(chi2_quantile(probability, np.arange(1.0, size + 1.0)))
     return jnp.asarray(np.concatenate([[0.0], bounds]), dtype)

@@ -1,4 +1,4 @@
-"""Monte Carlo localization in a map: global start, tracking, and recovery of a robot that got lost."""
+"""Monte Carlo localization in a map: global localization, tracking, and recovery from kidnapping."""
 
 import math
 from typing import Any
@@ -18,56 +18,57 @@ from jaxloc.filters.interface import Filter, FilterState, Info
 from jaxloc.poses import SE2
 from jaxloc.sensors.maps.occupancy_map import FreeSpace
 
-_SLOTS = 4096  # of the table in which poses are counted by place
+_SLOTS = 4096  # of the hash table of coarse cells
 _HALVINGS = 12
 
 
 class Recovery(eqx.Module):
-    """When to doubt that the robot is where the cloud is: augmented MCL.
+    """Injection of random poses after localization failures (augmented MCL).
 
-    Two running means follow how well scans fit, a quick and a slow one. When the quick one falls behind, that part of
-    the cloud is replaced by random poses: ``p = max(0, 1 - exp(fast - slow + tolerance))``, in nats a reading.
+    A fast and a slow running mean follow the fit of the measurements, their mean log likelihood. When the fast one
+    falls below the slow one, a share of the particles is replaced by random poses: ``p = max(0, 1 - exp(fast - slow +
+        tolerance))``, in nats per reading.
 
     Attributes:
         slow: weight of the newest fit in the slow mean.
-        fast: the same in the quick mean.
-        readings: how many independent readings a measurement holds; the fit is the log likelihood over these.
-        tolerance: by how much the quick mean may fall behind as scenes change, in nats a reading.
-        most: largest part of the cloud that is replaced in one step.
-        doubt: weight of all random poses together before they are compared with a scan: the probability that the robot
-            was carried away. With their share of the cloud instead, one cluttered scan would be enough to believe them.
+        fast: the same in the fast mean.
+        readings: number of independent readings in a measurement; the fit is the log likelihood over it.
+        tolerance: by how much the fast mean may fall below the slow one as scenes change, in nats per reading.
+        max_share: largest share of the particles that is replaced in one step.
+        kidnapping: total weight of all random poses before their first measurement: the prior probability that the
+            robot was kidnapped. With their share of the particles instead, one cluttered scan would suffice.
 
     References:
         Thrun, Burgard, Fox, *Probabilistic Robotics*, 2005, table 8.3 (there with likelihoods in place of their
-        logarithms, which one bad beam of many would decide).
+        logarithms, which a single outlier beam would dominate).
     """
 
     slow: float = eqx.field(static=True, default=0.02)
     fast: float = eqx.field(static=True, default=0.3)
     readings: float = eqx.field(static=True, default=1.0)
     tolerance: float = eqx.field(static=True, default=0.3)
-    most: float = eqx.field(static=True, default=0.9)
-    doubt: float = eqx.field(static=True, default=0.01)
+    max_share: float = eqx.field(static=True, default=0.9)
+    kidnapping: float = eqx.field(static=True, default=0.01)
 
-    def follow(self, mean: Float[Array, "2"], fit: Float[Array, ""], seen: Int[Array, ""]) -> Float[Array, "2"]:
-        """Both running means after one more fit; plain means while there are few."""
+    def smooth(self, mean: Float[Array, "2"], fit: Float[Array, ""], seen: Int[Array, ""]) -> Float[Array, "2"]:
+        """Both running means after one more fit; arithmetic means of the first few."""
         rates = jnp.maximum(jnp.array([self.slow, self.fast], mean.dtype), 1.0 / (seen.astype(mean.dtype) + 1.0))
         return mean + rates * (fit / self.readings - mean)
 
     def share(self, mean: Float[Array, "2"]) -> Float[Array, ""]:
-        """The part of the cloud to replace."""
-        return jnp.clip(1.0 - jnp.exp(jnp.minimum(mean[1] - mean[0] + self.tolerance, 0.0)), 0.0, self.most)
+        """The share of the particles to replace."""
+        return jnp.clip(1.0 - jnp.exp(jnp.minimum(mean[1] - mean[0] + self.tolerance, 0.0)), 0.0, self.max_share)
 
 
 class LocalizationState(FilterState):
-    """What the next step of Monte Carlo localization needs.
+    """State of Monte Carlo localization.
 
     Attributes:
-        particles: poses ``T_world_robot``, with weights that sum to one.
-        fit: slow and quick mean of how well scans fit, nats a reading.
-        inject: part of the cloud that the next prediction replaces by random poses.
-        seen: how many measurements there were.
-        step: how many predictions led here.
+        particles: poses ``T_world_robot``, with normalized weights.
+        fit: slow and fast mean of the fit of measurements, nats per reading.
+        inject: share of the particles that the next prediction replaces by random poses.
+        seen: number of measurements so far.
+        step: number of predictions so far.
     """
 
     particles: Particles
@@ -77,16 +78,16 @@ class LocalizationState(FilterState):
     step: Int[Array, ""]
 
     def estimate(self, radius: float = 1.0, angle: float = 0.7) -> "Place":
-        """The heaviest cluster of the cloud (see `find_place`)."""
+        """The heaviest cluster of the particles (see `find_place`)."""
         return find_place(self.particles, radius=radius, angle=angle)
 
 
 class Place(eqx.Module):
-    """Where a cloud says that the robot is.
+    """Pose estimate from the heaviest cluster of the particles.
 
     Attributes:
         pose: mean and covariance of the heaviest cluster.
-        mass: its part of the weight: one where there is no other place, small where nothing is known yet.
+        mass: its share of the weight: one without competing clusters, small during global localization.
     """
 
     pose: Gaussian
@@ -94,14 +95,14 @@ class Place(eqx.Module):
 
 
 class LocalizationInfo(Info):
-    """What an update of Monte Carlo localization says.
+    """Diagnostics of an update of Monte Carlo localization.
 
     Attributes:
         log_likelihood: of the measurement given all earlier ones.
-        ok: whether any particle fits the measurement.
+        ok: whether any particle has a positive likelihood.
         ess: effective sample size after the update.
-        exponent: to which power the likelihood was taken so that enough particles keep weight; one when tracking.
-        inject: part of the cloud that the next step replaces by random poses; zero while all is well.
+        exponent: power of the likelihood (tempering) that keeps the effective sample size; one when tracking.
+        inject: share of the particles that the next step replaces by random poses; zero when tracking.
         place: the estimate.
     """
 
@@ -114,30 +115,31 @@ class LocalizationInfo(Info):
 
 
 class MonteCarloLocalization(Filter):
-    """Particles over the poses of a robot in a map, from anywhere to a few centimeters.
+    """Monte Carlo localization (MCL): a particle filter over the poses of a robot in a map.
 
-    Each step resamples where few particles carry weight, replaces some by random poses where scans fit worse than they
-    used to, moves all by odometry and weighs them by the sensor. A likelihood that would leave less than `least_ess` of
-    the cloud is taken to the largest power below one that leaves as much: a global start then does not bet on one scan.
+    Each step resamples where the effective sample size is low, replaces some particles by random poses where the fit of
+    measurements has dropped, moves all by odometry and weights them by the sensor. A likelihood that would leave an
+    effective sample size below `least_ess` is tempered: raised to the largest power below one that leaves as much, so
+    that global localization does not depend on a single scan.
 
-    Predict once for each measurement that is used, with the odometry since the last one that was, and use measurements
-    only after the robot has moved: the same view twice is not twice the evidence.
+    Predict once for each measurement that is used, with the odometry since the last one that was used, and use
+    measurements only after the robot has moved: repeated views from one pose are not independent.
 
     Args:
         motion: of the odometry, such as `OdometryMotion`, best with a probability of slipping.
         sensor: of scans, landmarks, ... in the map; only its `log_prob` is used.
-        space: where random poses are drawn.
+        space: free space, from which random poses are sampled.
         resampling: strategy; `Systematic()`.
-        ess_threshold: resample below this part of the particles.
-        least_ess: part of the particles that a measurement leaves at least.
-        recovery: when to draw random poses; None for never.
-        adaptive: masks particles that are not needed when it resamples; None keeps all. (Arrays keep their size;
-            `resize` makes smaller ones.)
+        ess_threshold: resample where the effective sample size is below this share of the particles.
+        least_ess: smallest effective sample size after a measurement, as a share of the particles.
+        recovery: injection of random poses; None for never.
+        adaptive: number of particles after resampling (the others are masked); None keeps all. (Arrays keep their
+            size; `resize` makes smaller ones.)
 
     References:
         Dellaert, Fox, Burgard, Thrun, "Monte Carlo localization for mobile robots", ICRA 1999 [R-11]; Thrun, Burgard,
         Fox, *Probabilistic Robotics*, 2005, chapter 8; Jasra, Stephens, Doucet, Tsagaris, "Inference for Levy-driven
-        stochastic volatility models via adaptive sequential Monte Carlo", 2011, for the power.
+        stochastic volatility models via adaptive sequential Monte Carlo", 2011, for the tempering.
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxloc as jl
@@ -145,7 +147,7 @@ class MonteCarloLocalization(Filter):
         >>> grid = jl.sensors.OccupancyMap(walls, 0.1, jl.poses.SE2.identity())
         >>> sensor = jl.sensors.LikelihoodField(jl.sensors.DistanceField.of(grid))
         >>> filt = jl.filters.MonteCarloLocalization(jl.sensors.OdometryMotion(), sensor, grid.free_space())
-        >>> state = filt.start_globally(500, key=jax.random.key(0))
+        >>> state = filt.init_globally(500, key=jax.random.key(0))
         >>> state = filt.predict(state, jl.poses.SE2(0.1, 0.0, 0.0), key=jax.random.key(1))
         >>> scan = jl.sensors.LaserScan(jnp.full(30, 2.0), -1.5, 0.1)
         >>> state, info = filt.update(state, scan, jnp.ones(30, bool))
@@ -163,28 +165,28 @@ class MonteCarloLocalization(Filter):
     adaptive: KLDSize | None = None
 
     def init(self, prior: Particles) -> LocalizationState:
-        """The state before any data, from particles over poses."""
+        """The initial state, from particles over poses."""
         if not isinstance(prior, Particles):
             raise TypeError(
-                f"MonteCarloLocalization.init got a {type(prior).__name__}; use start_near(gaussian, n, key=key), "
-                "start_globally(n, key=key), or draw particles."
+                f"MonteCarloLocalization.init got a {type(prior).__name__}; use init_near(gaussian, n, key=key), "
+                "init_globally(n, key=key), or sample particles."
             )
         dtype, zero = prior.log_weights.dtype, jnp.zeros((), jnp.int32)
         return LocalizationState(prior.normalize(), jnp.zeros(2, dtype), jnp.zeros((), dtype), zero, zero)
 
     @eqx.filter_jit
-    def start_globally(self, num_particles: int, *, key: Key[Array, ""]) -> LocalizationState:
-        """A cloud spread evenly over the free space and all headings [R-11]."""
-        return self.init(Particles(self.space.spread(num_particles, key=key)))
+    def init_globally(self, num_particles: int, *, key: Key[Array, ""]) -> LocalizationState:
+        """Particles evenly distributed over the free space and all headings [R-11]."""
+        return self.init(Particles(self.space.sample_evenly(num_particles, key=key)))
 
     @eqx.filter_jit
-    def start_near(self, pose: Gaussian, num_particles: int, *, key: Key[Array, ""]) -> LocalizationState:
-        """A cloud about a known pose."""
+    def init_near(self, pose: Gaussian, num_particles: int, *, key: Key[Array, ""]) -> LocalizationState:
+        """Particles about a known pose."""
         return self.init(Particles.from_gaussian(pose, num_particles, key=key))
 
     @eqx.filter_jit
     def resize(self, state: LocalizationState, num_particles: int, *, key: Key[Array, ""]) -> LocalizationState:
-        """The same belief with more or fewer particles: few are enough once the place is known."""
+        """The same density with more or fewer particles: few suffice once the pose is known."""
         indices = systematic(key, finite_log_weights(state.particles), num_particles)
         particles = Particles(state.particles.take(indices)).normalize()
         return LocalizationState(particles, state.fit, state.inject, state.seen, state.step)
@@ -193,16 +195,18 @@ class MonteCarloLocalization(Filter):
     def predict(
         self, state: LocalizationState, control: Any, *, key: Key[Array, ""] | None = None
     ) -> LocalizationState:
-        """The cloud after a step of odometry, resampled and refreshed by random poses as needed."""
+        """The particles after a step of odometry, resampled and with random poses injected as needed."""
         if key is None:
-            raise ValueError("Monte Carlo localization draws: predict and run need a key, such as jax.random.key(0).")
+            raise ValueError(
+                "Monte Carlo localization is random: predict and run need a key such as jax.random.key(0)."
+            )
         key_resample, key_move, key_inject = jax.random.split(key, 3)
         particles = self._resample(state, key_resample)
         shape = (particles.size, self.motion.noise_dimension(state.particles.best()))
         normal = jax.random.normal(key_move, shape, particles.log_weights.dtype)
         values = jax.vmap(lambda pose, n: self.motion.perturb(pose, control, n))(particles.values, normal)
         particles = Particles(values, particles.log_weights, particles.valid)
-        # Drawing random poses is dear, and a robot that knows its place needs none.
+        # Sampling random poses is expensive, and not needed when tracking.
         particles = lax.cond(
             state.inject > 0, lambda: self._inject(particles, state.inject, key_inject), lambda: particles
         )
@@ -212,10 +216,10 @@ class MonteCarloLocalization(Filter):
     def update(
         self, state: LocalizationState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[LocalizationState, LocalizationInfo]:
-        """The cloud weighed by a measurement.
+        """The particles weighted by a measurement.
 
-        Where no particle fits it at all, the cloud stays as it was, ``ok`` is False, and the next prediction replaces
-        half of it by random poses.
+        Where no particle has a positive likelihood, the particles are unchanged, ``ok`` is False, and the next
+        prediction replaces half of them by random poses.
         """
         del key
         before = state.particles
@@ -225,9 +229,9 @@ class MonteCarloLocalization(Filter):
         ok = full.ok & there
         logs = jnp.where(jnp.isfinite(logs), logs, float(jnp.finfo(logs.dtype).min) * 1e-3)
         exponent = self._exponent(before, logs)
-        weighed = Particles(before.values, before.log_weights + exponent * logs, before.valid).normalize()
-        particles = tree.where(ok, weighed, before)
-        fit, inject = self._follow(state, jnp.sum(jnp.where(weighed.weights > 0, weighed.weights * logs, 0.0)))
+        weighted = Particles(before.values, before.log_weights + exponent * logs, before.valid).normalize()
+        particles = tree.where(ok, weighted, before)
+        fit, inject = self._follow(state, jnp.sum(jnp.where(weighted.weights > 0, weighted.weights * logs, 0.0)))
         after = LocalizationState(
             particles,
             jnp.where(ok, fit, state.fit),
@@ -243,11 +247,11 @@ class MonteCarloLocalization(Filter):
     def _follow(self, state: LocalizationState, fit: Array) -> tuple[Array, Array]:
         if self.recovery is None:
             return state.fit, jnp.zeros_like(state.inject)
-        mean = self.recovery.follow(state.fit, fit, state.seen)
+        mean = self.recovery.smooth(state.fit, fit, state.seen)
         return mean, self.recovery.share(mean)
 
     def _exponent(self, particles: Particles, logs: Array) -> Array:
-        """The largest power of the likelihood, at most one, that leaves the effective sample size that is asked for."""
+        """The largest power of the likelihood, at most one, that keeps the smallest effective sample size."""
         least = self.least_ess * particles.count.astype(logs.dtype)
 
         def enough(power):
@@ -277,7 +281,7 @@ class MonteCarloLocalization(Filter):
         return self.resampling.resample(particles, key=key, count=count).particles
 
     def _inject(self, particles: Particles, share: Array, key: Array) -> Particles:
-        """Random poses in place of a part of the cloud, with little weight before they have seen a scan."""
+        """Replaces a share of the particles by random poses of small weight."""
         key_choose, key_draw = jax.random.split(key)
         fresh = self.space.sample(particles.size, key=key_draw)
         chosen = jax.random.uniform(key_choose, (particles.size,), share.dtype) < share
@@ -286,8 +290,8 @@ class MonteCarloLocalization(Filter):
             return jnp.where(chosen.reshape(-1, *(1,) * (old.ndim - 1)), new.astype(old.dtype), old)
 
         values = jax.tree.map(swap, fresh, particles.values)
-        doubt = 0.5 if self.recovery is None else self.recovery.doubt
-        level = math.log(doubt) - jnp.log(jnp.maximum(jnp.sum(chosen), 1).astype(share.dtype))
+        weight = 0.5 if self.recovery is None else self.recovery.kidnapping
+        level = math.log(weight) - jnp.log(jnp.maximum(jnp.sum(chosen), 1).astype(share.dtype))
         return Particles(values, jnp.where(chosen, level, particles.log_weights), particles.valid | chosen).normalize()
 
 
@@ -295,14 +299,15 @@ class MonteCarloLocalization(Filter):
 def find_place(
     particles: Particles, *, radius: float | Float[Array, ""] = 1.0, angle: float | Float[Array, ""] = 0.7
 ) -> Place:
-    """The heaviest cluster of a cloud of planar poses, and how much of the weight it holds.
+    """The heaviest cluster of particles over planar poses, and its share of the weight.
 
-    Poses are counted by place in a coarse grid; the mean of those near the heaviest cell's own mean is the estimate.
+    Weights are summed over a coarse grid of poses; the estimate is the mean of the particles near the mean of the
+    heaviest cell.
 
     Args:
         particles: over `SE2`.
-        radius: of a cluster, m.
-        angle: the same for headings, rad.
+        radius: of a cluster in position, m.
+        angle: of a cluster in heading, rad.
 
     Returns:
         Mean, covariance (tangent space of the mean) and mass of the cluster.
@@ -340,7 +345,7 @@ def _near(particles: Particles, center: SE2, radius: Any, angle: Any) -> Particl
 
 
 def _slots(poses: SE2, radius: Any, angle: Any) -> Int[Array, " n"]:
-    """A slot for the coarse cell of each pose."""
+    """Hash table slot of the coarse cell of each pose."""
     cells = jnp.floor(poses.translation / radius).astype(jnp.int32).astype(jnp.uint32)
     headings = jnp.arctan2(poses.rotation.sin, poses.rotation.cos) + math.pi
     turns = jnp.floor(headings / angle).astype(jnp.int32).astype(jnp.uint32)

@@ -1,4 +1,4 @@
-"""How things move between two instants: linear models, constant velocity and acceleration, turns, and driven poses."""
+"""Motion models: linear, constant velocity, constant acceleration, coordinated turn, and poses driven by twists."""
 
 from abc import abstractmethod
 from typing import Any
@@ -14,12 +14,12 @@ from jaxloc.poses.lie_group import Group, as_floats
 
 
 class LinearMotion(Motion):
-    """``x' = F x + B u + w``, ``w ~ N(0, Q)``: the same at every step.
+    """Linear motion ``x' = F x + B u + w``, ``w ~ N(0, Q)``, the same at every step.
 
     Args:
         transition: F.
         noise_covariance: Q.
-        input_matrix: B; None where no input drives the state (the control is then ignored, and may be None).
+        input_matrix: B; None for no input (the control is then ignored, and may be None).
 
     References:
         Kalman, "A new approach to linear filtering and prediction problems", 1960 [T-56].
@@ -59,9 +59,13 @@ class _Kinematic(Motion):
         padding: trailing entries of the state that this model holds at zero.
     """
 
-    intensity: eqx.AbstractVar[Float[Array, "*axes"]]
-    axes: eqx.AbstractVar[int]
-    padding: eqx.AbstractVar[int]
+    intensity: Float[Array, "*axes"]
+    axes: int = eqx.field(static=True)
+    padding: int = eqx.field(static=True)
+
+    def __init__(self, intensity: Any, axes: int = 2, padding: int = 0):
+        (self.intensity,) = as_floats(intensity)
+        self.axes, self.padding = axes, padding
 
     @abstractmethod
     def chain(self, dt: Float[Array, ""]) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
@@ -72,7 +76,7 @@ class _Kinematic(Motion):
         return self.linearize(state, control)[0]
 
     def covariance(self, state: Float[Array, " d"], control: Float[Array, ""]) -> Float[Array, "d d"]:
-        """Of the noise that gathers in `control` seconds."""
+        """Covariance of the noise accumulated in `control` seconds."""
         intensity = jnp.broadcast_to(self.intensity, (self.axes,)).astype(state.dtype)
         noise = self.chain(control.astype(state.dtype))[1]
         return self._padded(noise[:, None, :, None] * jnp.diag(intensity)[None, :, None, :])
@@ -114,14 +118,6 @@ class ConstantVelocity(_Kinematic):
         [0.5, 1.0, 1.0, 2.0]
     """
 
-    intensity: Float[Array, "*axes"]
-    axes: int = eqx.field(static=True)
-    padding: int = eqx.field(static=True)
-
-    def __init__(self, intensity: Any, axes: int = 2, padding: int = 0):
-        (self.intensity,) = as_floats(intensity)
-        self.axes, self.padding = axes, padding
-
     def chain(self, dt: Float[Array, ""]) -> tuple[Float[Array, "2 2"], Float[Array, "2 2"]]:
         """Transition and noise of one axis."""
         one, zero = jnp.ones_like(dt), jnp.zeros_like(dt)
@@ -146,14 +142,6 @@ class ConstantAcceleration(_Kinematic):
         [2.0, 3.0, 2.0]
     """
 
-    intensity: Float[Array, "*axes"]
-    axes: int = eqx.field(static=True)
-    padding: int = eqx.field(static=True)
-
-    def __init__(self, intensity: Any, axes: int = 2, padding: int = 0):
-        (self.intensity,) = as_floats(intensity)
-        self.axes, self.padding = axes, padding
-
     def chain(self, dt: Float[Array, ""]) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Transition and noise of one axis."""
         one, zero = jnp.ones_like(dt), jnp.zeros_like(dt)
@@ -167,9 +155,9 @@ class ConstantAcceleration(_Kinematic):
 
 
 class CoordinatedTurn(Motion):
-    """A turn at constant speed and rate: the state is x, y, its velocity, and the turn rate; the control is ``dt``, s.
+    """Coordinated turn: the state is x, y, its velocity, and the turn rate; the control is the step ``dt``, s.
 
-    Straight driving, a turn rate of zero, is no special case: value and gradients are exact there.
+    Value and gradients are exact at a turn rate of zero, too.
 
     Args:
         intensity: spectral density of the acceleration, m^2/s^3.
@@ -198,23 +186,23 @@ class CoordinatedTurn(Motion):
         angle = rate * control
         across = jnp.stack([-velocity[1], velocity[0]])
         along = series.sinc(angle**2)
-        aside = angle * series.versine(angle**2)
-        position = state[:2] + control * (along * velocity + aside * across)
+        lateral = angle * series.versine(angle**2)
+        position = state[:2] + control * (along * velocity + lateral * across)
         turned = jnp.cos(angle) * velocity + jnp.sin(angle) * across
         return jnp.concatenate([position, turned, rate[None]])
 
     def covariance(self, state: Float[Array, "5"], control: Float[Array, ""]) -> Float[Array, "5 5"]:
-        """Of the noise that gathers in `control` seconds."""
+        """Covariance of the noise accumulated in `control` seconds."""
         straight = ConstantVelocity(self.intensity, axes=2, padding=1).covariance(state, control)
         return straight.at[4, 4].set(self.turn_intensity.astype(state.dtype) * control)
 
 
 class BodyTwist(eqx.Module):
-    """What drives a pose for one step.
+    """Control of `TwistMotion`: a constant twist for one step.
 
     Attributes:
         twist: velocity in the body frame, (translation, rotation), m/s and rad/s.
-        dt: for how long, s.
+        dt: duration, s.
     """
 
     twist: Float[Array, "*t d"]

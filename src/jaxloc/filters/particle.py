@@ -1,4 +1,4 @@
-"""The particle filter: bootstrap, guided and auxiliary, with any resampling, on any state."""
+"""Particle filter: bootstrap, guided and auxiliary, with any resampling strategy, on any state."""
 
 import math
 from typing import Any
@@ -16,34 +16,34 @@ from jaxloc.beliefs.kld_sampling import KLDSize
 from jaxloc.beliefs.particles import NOTHING
 from jaxloc.beliefs.resampling.strategies import Resampling, Systematic
 from jaxloc.filters.interface import Filter, FilterState, Info
-from jaxloc.filters.proposals import Bootstrap, Choice, Draft, Proposal, Reading, score
+from jaxloc.filters.proposals import Bootstrap, MotionNoise, Observation, Proposal, Resampled, score
 from jaxloc.poses import local, retract
 
 
 class ParticleState(FilterState):
-    """What the next step of a particle filter needs.
+    """State of the particle filter.
 
     Attributes:
-        particles: with weights that sum to one.
-        ancestors: for each particle, which one of the last step it came from.
+        particles: with normalized weights.
+        ancestors: for each particle, the index of its ancestor before the last step.
         resampled: whether the last step resampled; if not, each is its own ancestor.
-        draft: how the particles were predicted, for proposals that use the measurement.
-        step: how many predictions led here.
+        noise: of the last prediction, for proposals that use the measurement.
+        step: number of predictions so far.
     """
 
     particles: Particles
     ancestors: Int[Array, " n"]
     resampled: Bool[Array, ""]
-    draft: Draft | None
+    noise: MotionNoise | None
     step: Int[Array, ""]
 
 
 class ParticleInfo(Info):
-    """What an update of a particle filter says.
+    """Diagnostics of an update of the particle filter.
 
     Attributes:
-        log_likelihood: estimate for the measurement given all earlier ones, whose sums are unbiased estimates of the
-            likelihood (not of its logarithm); where no particle has any, the logarithm of the least positive number.
+        log_likelihood: estimate for the measurement given all earlier ones; the exponential of their sum is an unbiased
+            estimate of the likelihood. Where no particle has any, the logarithm of the least positive number.
         ok: whether any particle fits the measurement.
         ess: effective sample size after the update.
         resampled: whether this step resampled.
@@ -58,27 +58,27 @@ class ParticleInfo(Info):
 
 
 class ParticleFilter(Filter):
-    """Monte Carlo filter: particles moved by a `Motion`, weighed by a `Sensor`, resampled when few carry weight.
+    """Particle filter (sequential importance resampling) of any `Motion` and `Sensor`.
 
-    A step resamples (where the effective sample size has fallen below the threshold), moves, and weighs; states keep
-    the weighted particles, from which estimates are best. Where no particle fits a measurement, `ok` is False, and the
-    predicted cloud goes on with equal weights, spread wider about its mean.
+    A step resamples (where the effective sample size is below the threshold), moves and weights the particles; states
+    hold the weighted particles, from which estimates are best. Where no particle has a positive likelihood, `ok` is
+    False, and the predicted particles are kept with equal weights and an inflated covariance.
 
-    Gradients of the log likelihood with respect to the models have, with the default strategies, the expectation of the
-    exact score, up to what vanishes with the number of particles. All random numbers of a step are drawn at once.
+    With the default strategies, gradients of the log likelihood with respect to the models have the expectation of the
+    exact score, up to terms that vanish with the number of particles.
 
     Args:
-        motion: transition density; `perturb` draws from it.
+        motion: transition density, sampled by `perturb`.
         sensor: measurement density, by `log_prob`.
         proposal: `Bootstrap()`, `Guided()` or `Auxiliary()`.
         resampling: `Systematic()`, `Stratified()`, `Multinomial()`, `Residual()`, `Soft()` or `OptimalTransport()`.
         ess_threshold: resample where the effective sample size is below this part of the particles: 1 for every step,
             0 for never.
-        adaptive: masks particles that are not needed, whenever it resamples; None keeps all.
-        respread: by which part a cloud that fits no measurement grows.
-        pathwise: how gradients pass a random step. False: by its score, with the particles held where they are; this
-            needs `Motion.log_prob`, hence noise in all directions. True: along the particles, which any motion allows,
-            at a variance that is far greater unless the proposal is guided. None: as suits the resampling.
+        adaptive: number of particles after resampling (the others are masked); None keeps all.
+        inflation: relative displacement r of the particles where none has a likelihood (see `inflate`).
+        pathwise: gradient estimator of random steps. False: score function, with the particles held fixed; this needs
+            `Motion.log_prob`, hence noise in all directions. True: pathwise (reparameterization), for any motion, with
+            a far larger variance unless the proposal is guided. None: as the resampling strategy has it.
 
     References:
         Review section 3.1 [R-5, R-7, R-9, R-10]; Gordon, Salmond, Smith, 1993; Doucet and Johansen, "A tutorial on
@@ -103,38 +103,38 @@ class ParticleFilter(Filter):
     resampling: Resampling = Systematic()
     ess_threshold: float = eqx.field(static=True, default=0.5)
     adaptive: KLDSize | None = None
-    respread: float = eqx.field(static=True, default=0.25)
+    inflation: float = eqx.field(static=True, default=0.25)
     pathwise: bool | None = eqx.field(static=True, default=None)
 
     def init(self, prior: Any) -> ParticleState:
-        """The state before any data.
+        """The initial state.
 
         Args:
-            prior: particles, such as `Particles.from_gaussian(gaussian, n, key=key)`. They may be spread over devices
-                (and stay there) along a mesh axis of the type `jax.sharding.AxisType.Auto`.
+            prior: particles, such as `Particles.from_gaussian(gaussian, n, key=key)`. They may be sharded over devices
+                (and stay so) along a mesh axis of the type `jax.sharding.AxisType.Auto`.
 
         Raises:
             TypeError: the prior is no `Particles`.
-            ValueError: the particles are spread along a mesh axis of the type `Explicit`.
+            ValueError: the particles are sharded along a mesh axis of the type `Explicit`.
         """
         if not isinstance(prior, Particles):
             raise TypeError(
-                f"ParticleFilter.init got a {type(prior).__name__}; draw particles from it, for example by "
+                f"ParticleFilter.init got a {type(prior).__name__}; sample particles from it, for example by "
                 "Particles.from_gaussian(prior, num_particles, key=key)."
             )
         _refuse_explicit(prior.log_weights)
         indices = jnp.arange(prior.size, dtype=jnp.int32)
-        draft, zero = self.proposal.begin(prior.values), jnp.zeros((), jnp.int32)
-        return ParticleState(prior.normalize(), indices, jnp.zeros((), bool), draft, zero)
+        noise, zero = self.proposal.init_noise(prior.values), jnp.zeros((), jnp.int32)
+        return ParticleState(prior.normalize(), indices, jnp.zeros((), bool), noise, zero)
 
     @eqx.filter_jit
     def predict(self, state: ParticleState, control: Any, *, key: Key[Array, ""] | None = None) -> ParticleState:
-        """The particles, resampled if needed, after one random step each."""
+        """The particles one step ahead, resampled if needed."""
         if key is None:
-            raise ValueError("A particle filter draws: predict and run need a key, such as jax.random.key(0).")
+            raise ValueError("A particle filter is random: predict and run need a key, such as jax.random.key(0).")
         key_resample, key_move = jax.random.split(key)
-        if self.proposal.looks_ahead:
-            choice = _everyone(state.particles)
+        if self.proposal.resamples_with_measurement:
+            choice = _unchanged(state.particles)
         else:
             choice = self.resample(state.particles, key=key_resample)
         drawn = self.proposal.draw(self.motion, choice.particles.values, control, key=key_move)
@@ -142,55 +142,56 @@ class ParticleFilter(Filter):
         if not self._pathwise:
             values, log_weights = lax.stop_gradient(values), log_weights + score(drawn.log_density)
         particles = Particles(values, log_weights, choice.particles.valid)
-        return ParticleState(particles, choice.ancestors, choice.resampled, drawn.draft, state.step + 1)
+        return ParticleState(particles, choice.ancestors, choice.resampled, drawn.noise, state.step + 1)
 
     @eqx.filter_jit
     def update(
         self, state: ParticleState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[ParticleState, ParticleInfo]:
-        """The particles weighed by a measurement; a key is needed by `Auxiliary` alone."""
-        if key is None and self.proposal.looks_ahead:
+        """The particles weighted by a measurement; only `Auxiliary` needs a key."""
+        if key is None and self.proposal.resamples_with_measurement:
             raise ValueError("Auxiliary resamples in its update, which needs a key.")
-        reading = Reading(self.sensor, measurement, valid, self._pathwise)
-        weighed = self.proposal.weigh(
-            state.particles, state.draft, reading, lambda particles: self.resample(particles, key=key)
+        observation = Observation(self.sensor, measurement, valid, self._pathwise)
+        weighted = self.proposal.weigh(
+            state.particles, state.noise, observation, lambda particles: self.resample(particles, key=key)
         )
-        ok = weighed.particles.ok
-        particles = lax.cond(ok, lambda: weighed.particles.normalize(), lambda: self.spread(state.particles))
-        choice = weighed.choice or Choice(state.particles, state.ancestors, state.resampled)
-        after = ParticleState(particles, choice.ancestors, choice.resampled, weighed.draft, state.step)
-        there = jnp.any(valid)
-        after = tree.where(there, after, state)
+        ok = weighted.particles.ok
+        particles = lax.cond(ok, lambda: weighted.particles.normalize(), lambda: self.inflate(state.particles))
+        choice = weighted.choice or Resampled(state.particles, state.ancestors, state.resampled)
+        after = ParticleState(particles, choice.ancestors, choice.resampled, weighted.noise, state.step)
+        measured = jnp.any(valid)
+        after = tree.where(measured, after, state)
         floor = math.log(float(jnp.finfo(particles.log_weights.dtype).tiny))
-        likelihood = jnp.where(ok, weighed.particles.log_total, floor)
+        likelihood = jnp.where(ok, weighted.particles.log_total, floor)
         info = ParticleInfo(
-            log_likelihood=jnp.where(there, likelihood, 0.0),
-            ok=ok | ~there,
+            log_likelihood=jnp.where(measured, likelihood, 0.0),
+            ok=ok | ~measured,
             ess=after.particles.ess,
             resampled=after.resampled,
             count=after.particles.count,
         )
         return after, info
 
-    def resample(self, particles: Particles, *, key: Key[Array, ""]) -> Choice:
+    def resample(self, particles: Particles, *, key: Key[Array, ""]) -> Resampled:
         """Resamples where the effective sample size is below the threshold."""
         if self.ess_threshold <= 0.0:
-            return _everyone(particles)
+            return _unchanged(particles)
         if self.ess_threshold >= 1.0:
             return self._draw(particles, key)
         needed = particles.ess < self.ess_threshold * particles.count.astype(particles.log_weights.dtype)
-        return lax.cond(needed, lambda: self._draw(particles, key), lambda: _everyone(particles))
+        return lax.cond(needed, lambda: self._draw(particles, key), lambda: _unchanged(particles))
 
-    def spread(self, particles: Particles) -> Particles:
-        """Equal particles, each moved away from another one: the mean stays, the covariance grows.
+    def inflate(self, particles: Particles) -> Particles:
+        """Equally weighted particles with the same mean and an inflated covariance.
 
-        ``x_i' = retract(x_i, -r local(x_i, x_j))`` with j half the stack away; variances grow by ``1 + 2 r + 2 r^2``.
+        ``x_i' = retract(x_i, -r local(x_i, x_j))`` with j half the stack away; variances are multiplied by ``1 + 2 r +
+        2 r^2``.
         """
         shifted = jax.tree.map(lambda leaf: jnp.roll(leaf, particles.size // 2, axis=0), particles.values)
         both = particles.valid & jnp.roll(particles.valid, particles.size // 2)
 
-        def away(value, other, there):
-            return retract(value, jnp.where(there, -self.respread * local(value, other), 0.0))
+        def away(value, other, valid):
+            return retract(value, jnp.where(valid, -self.inflation * local(value, other), 0.0))
 
         values = jax.vmap(away)(particles.values, shifted, both)
         level = jnp.where(particles.valid, jnp.zeros_like(particles.log_weights), NOTHING)
@@ -200,26 +201,26 @@ class ParticleFilter(Filter):
     def _pathwise(self) -> bool:
         return self.resampling.pathwise if self.pathwise is None else self.pathwise
 
-    def _draw(self, particles: Particles, key: Array) -> Choice:
+    def _draw(self, particles: Particles, key: Array) -> Resampled:
         count = None
         if self.adaptive is not None:
             key, key_count = jax.random.split(key)
             full = Systematic().resample(particles, key=key_count).particles
             count = self.adaptive.count(full)
         drawn = self.resampling.resample(particles, key=key, count=count)
-        return Choice(drawn.particles, drawn.ancestors, jnp.ones((), bool))
+        return Resampled(drawn.particles, drawn.ancestors, jnp.ones((), bool))
 
 
-def _everyone(particles: Particles) -> Choice:
+def _unchanged(particles: Particles) -> Resampled:
     indices = jnp.arange(particles.size, dtype=jnp.int32)
-    return Choice(particles, indices, jnp.zeros((), bool))
+    return Resampled(particles, indices, jnp.zeros((), bool))
 
 
 def _refuse_explicit(array: Array) -> None:
-    """Resampling moves particles between devices, which explicit sharding would have spelled out everywhere."""
+    """Resampling moves particles between devices, which explicit sharding would require in all types."""
     types = getattr(getattr(jax.typeof(array).sharding, "mesh", None), "axis_types", ())
     if AxisType.Explicit in types:
         raise ValueError(
-            "The particles are spread over a mesh with explicit axes; make it with automatic ones: "
+            "The particles are sharded over a mesh with explicit axes; make it with automatic ones: "
             "jax.make_mesh(shape, names, axis_types=(jax.sharding.AxisType.Auto,) * len(names))."
         )

@@ -1,4 +1,4 @@
-"""Where a particle filter looks for the next state: along the motion, at what was measured, or after a look ahead."""
+"""Proposal distributions of particle filters: bootstrap, guided (conditioned on the measurement) and auxiliary."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -19,14 +19,14 @@ from jaxloc.beliefs.square_root import cholesky, whiten
 from jaxloc.poses import local, retract, tangent_dimension
 
 
-class Draft(eqx.Module):
-    """How the particles of a prediction came about, for proposals that improve them once there is a measurement.
+class MotionNoise(eqx.Module):
+    """Motion noise drawn in a prediction, for proposals that condition it on the measurement later.
 
     Attributes:
         centers: particles moved without noise.
         roots: square roots of the covariance of the motion's noise.
-        normals: the standard normal numbers that were used: ``retract(center, root @ normal)`` are the particles.
-        fresh: whether no measurement has been used since.
+        normals: standard normal numbers of the draw: ``retract(center, root @ normal)`` are the particles.
+        fresh: whether no measurement has been used since the draw.
     """
 
     centers: Any
@@ -35,13 +35,13 @@ class Draft(eqx.Module):
     fresh: Bool[Array, ""]
 
 
-class Choice(eqx.Module):
+class Resampled(eqx.Module):
     """Particles after a conditional resampling.
 
     Attributes:
         particles: as many as before.
-        ancestors: where each came from.
-        resampled: whether they were drawn; if not, each is its own ancestor.
+        ancestors: index of the particle that each came from.
+        resampled: whether they were resampled; if not, each is its own ancestor.
     """
 
     particles: Particles
@@ -49,62 +49,70 @@ class Choice(eqx.Module):
     resampled: Bool[Array, ""]
 
 
-class Weighed(eqx.Module):
-    """Particles with the measurement in their weights, not normalized.
+class Weighted(eqx.Module):
+    """Particles weighted by a measurement, not normalized.
 
     Attributes:
-        particles: whose total weight is the likelihood of the measurement.
-        draft: after its use.
-        choice: of ancestors, where the proposal resampled by itself.
+        particles: their total weight is the likelihood of the measurement.
+        noise: of the motion, marked as used.
+        choice: result of resampling, where the proposal resampled.
     """
 
     particles: Particles
-    draft: Draft | None
-    choice: Choice | None
+    noise: MotionNoise | None
+    choice: Resampled | None
 
 
-class Drawn(eqx.Module):
+class Sampled(eqx.Module):
     """Particles moved by the motion.
 
     Attributes:
-        values: where they went.
-        draft: what is kept for `Proposal.weigh`.
-        log_density: of the motion at the values, held fixed: its derivative is the score of the draws.
+        values: their new states.
+        noise: of the motion, kept for `Proposal.weigh`.
+        log_density: of the motion at the values, held fixed: its derivative is the score function.
     """
 
     values: Any
-    draft: Draft | None
+    noise: MotionNoise | None
     log_density: Float[Array, " n"]
 
 
 class Proposal(eqx.Module):
-    """How particles are drawn and weighed."""
+    """How particles are sampled and weighted.
 
-    looks_ahead: eqx.AbstractClassVar[bool]
+    Attributes:
+        resamples_with_measurement: whether `weigh` resamples, instead of the filter before the prediction.
+    """
+
+    resamples_with_measurement: eqx.AbstractClassVar[bool]
 
     @abstractmethod
-    def begin(self, values: Any) -> Draft | None:
-        """What is kept beside particles that no motion has made."""
+    def init_noise(self, values: Any) -> MotionNoise | None:
+        """Placeholder noise of initial particles."""
 
     @abstractmethod
-    def draw(self, motion: Motion, values: Any, control: Any, *, key: Key[Array, ""]) -> Drawn:
+    def draw(self, motion: Motion, values: Any, control: Any, *, key: Key[Array, ""]) -> Sampled:
         """Particles moved by the motion."""
 
     @abstractmethod
     def weigh(
-        self, particles: Particles, draft: Draft | None, reading: "Reading", resample: Callable[[Particles], Choice]
-    ) -> Weighed:
-        """Particles weighed by the reading, perhaps moved by it."""
+        self,
+        particles: Particles,
+        noise: MotionNoise | None,
+        observation: "Observation",
+        resample: Callable[[Particles], Resampled],
+    ) -> Weighted:
+        """Particles weighed by the observation, perhaps moved by it."""
 
 
-class Reading(eqx.Module):
-    """A sensor and what it read.
+class Observation(eqx.Module):
+    """A measurement with its sensor model.
 
     Attributes:
         sensor: the model.
-        measurement: what was read.
-        valid: of it, what counts.
-        pathwise: whether derivatives pass through the places of the particles; else through their density.
+        measurement: the measurement.
+        valid: mask of the measurement.
+        pathwise: whether derivatives pass through the particles' values; else through the score function.
     """
 
     sensor: Sensor
@@ -113,45 +121,45 @@ class Reading(eqx.Module):
     pathwise: bool = eqx.field(static=True)
 
     def log_likelihood(self, values: Any) -> Float[Array, " n"]:
-        """Of the reading at each particle; `NOTHING` where it is no number or zero."""
+        """Log likelihood at each particle; `NOTHING` where it is NaN or minus infinity."""
         found = jax.vmap(lambda value: self.sensor.log_prob(value, self.measurement, self.valid))(values)
         good = (found > NOTHING) & (found < jnp.inf)
         return jnp.where(good, jnp.where(good, found, 0.0), NOTHING)
 
 
 class Bootstrap(Proposal):
-    """Particles drawn by the motion (`Motion.perturb`), weighed by the likelihood (`Sensor.log_prob`).
+    """Particles sampled from the motion (`Motion.perturb`), weighted by the likelihood (`Sensor.log_prob`).
 
     References:
         Gordon, Salmond, Smith, 1993 [R-7].
     """
 
-    looks_ahead = False
+    resamples_with_measurement = False
 
-    def begin(self, values: Any) -> None:
-        """Nothing is kept."""
+    def init_noise(self, values: Any) -> None:
+        """None is needed."""
         return None
 
-    def draw(self, motion: Motion, values: Any, control: Any, *, key: Key[Array, ""]) -> Drawn:
+    def draw(self, motion: Motion, values: Any, control: Any, *, key: Key[Array, ""]) -> Sampled:
         """Particles moved by the motion."""
         normals = _normals(motion.noise_dimension(_first(values)), values, key)
         moved = jax.vmap(lambda value, normal: motion.perturb(value, control, normal))(values, normals)
         density = jax.vmap(lambda value, end: motion.log_prob(value, control, end))(values, lax.stop_gradient(moved))
-        return Drawn(moved, None, density)
+        return Sampled(moved, None, density)
 
-    def weigh(self, particles: Particles, draft: None, reading: Reading, resample: Any) -> Weighed:
-        """Particles weighed by the likelihood."""
-        return Weighed(_weighed(particles, reading.log_likelihood(particles.values)), None, None)
+    def weigh(self, particles: Particles, noise: None, observation: Observation, resample: Any) -> Weighted:
+        """Particles weighted by the likelihood."""
+        return Weighted(_add_log_likelihood(particles, observation.log_likelihood(particles.values)), None, None)
 
 
 class Guided(Proposal):
-    """Particles drawn from ``p(x' | x, z)`` for a sensor that is linear about each moved particle.
+    """Particles sampled from ``p(x' | x, z)``, with the sensor linearized at each moved particle.
 
     Per particle, the noise of the motion ``N(0, L L^T)`` is conditioned on the measurement by one Kalman update about
-    the moved particle, and the numbers that `draw` used are sent through its root once more. The weight is the
-    predictive likelihood of the measurement, times what linearizing missed, so that any sensor is weighed exactly.
+    the moved particle, and the normal numbers of `draw` are transformed by its root. The weight is the predictive
+    likelihood of the measurement, times a correction of the linearization, so that weights are exact for any sensor.
 
-    It needs tangent noise: a `Motion` with `covariance`, whose `perturb` is not overridden.
+    Requires tangent noise: a `Motion` with `covariance`, whose `perturb` is not overridden.
 
     References:
         Doucet, Godsill, Andrieu, "On sequential Monte Carlo sampling methods for Bayesian filtering", Statistics and
@@ -159,32 +167,34 @@ class Guided(Proposal):
         covariance equations", AIAA J. 1968.
     """
 
-    looks_ahead = False
+    resamples_with_measurement = False
 
-    def begin(self, values: Any) -> Draft:
-        """A draft that is used up."""
-        return _no_draft(values)
+    def init_noise(self, values: Any) -> MotionNoise:
+        """A placeholder marked as used."""
+        return _unused_noise(values)
 
-    def draw(self, motion: Motion, values: Any, control: Any, *, key: Key[Array, ""]) -> Drawn:
-        """Particles moved by the motion, and how."""
-        return _drafted(motion, values, control, key)
+    def draw(self, motion: Motion, values: Any, control: Any, *, key: Key[Array, ""]) -> Sampled:
+        """Particles moved by the motion, with its noise."""
+        return _sample(motion, values, control, key)
 
-    def weigh(self, particles: Particles, draft: Draft, reading: Reading, resample: Any) -> Weighed:
-        """Particles moved towards the measurement, weighed by its predictive likelihood."""
-        particles = _forget(particles, draft, reading)
-        return Weighed(_guide(particles, draft, _conditioned(draft, reading), reading), _used(draft), None)
+    def weigh(self, particles: Particles, noise: MotionNoise, observation: Observation, resample: Any) -> Weighted:
+        """Particles sampled given the measurement, weighted by its predictive likelihood."""
+        particles = _without_score(particles, noise, observation)
+        return Weighted(
+            _move_conditioned(particles, noise, _conditioned(noise, observation), observation), _mark_used(noise), None
+        )
 
 
 class Auxiliary(Proposal):
-    """Ancestors chosen by how well the measurement fits where they lead: the measurement is known before resampling.
+    """Auxiliary particle filter: ancestors are resampled by the predicted likelihood of the measurement.
 
     First-stage weights are those of the particles times the likelihood at the moved particle without noise (or, guided,
     times the predictive likelihood, which makes the filter fully adapted where the sensor is linear).
 
-    It needs tangent noise: a `Motion` with `covariance`, whose `perturb` is not overridden.
+    Requires tangent noise: a `Motion` with `covariance`, whose `perturb` is not overridden.
 
     Attributes:
-        guided: draw from `Guided` instead of the motion.
+        guided: sample from `Guided` instead of the motion.
 
     References:
         Pitt and Shephard, "Filtering via simulation: auxiliary particle filters", JASA 1999.
@@ -192,39 +202,45 @@ class Auxiliary(Proposal):
 
     guided: bool = eqx.field(static=True, default=False)
 
-    looks_ahead = True
+    resamples_with_measurement = True
 
-    def begin(self, values: Any) -> Draft:
-        """A draft that is used up."""
-        return _no_draft(values)
+    def init_noise(self, values: Any) -> MotionNoise:
+        """A placeholder marked as used."""
+        return _unused_noise(values)
 
-    def draw(self, motion: Motion, values: Any, control: Any, *, key: Key[Array, ""]) -> Drawn:
-        """Particles moved by the motion, and how."""
-        return _drafted(motion, values, control, key)
+    def draw(self, motion: Motion, values: Any, control: Any, *, key: Key[Array, ""]) -> Sampled:
+        """Particles moved by the motion, with its noise."""
+        return _sample(motion, values, control, key)
 
     def weigh(
-        self, particles: Particles, draft: Draft, reading: Reading, resample: Callable[[Particles], Choice]
-    ) -> Weighed:
+        self,
+        particles: Particles,
+        noise: MotionNoise,
+        observation: Observation,
+        resample: Callable[[Particles], Resampled],
+    ) -> Weighted:
         """Particles chosen by the first-stage weights, drawn again, and weighed by what those missed."""
-        particles = _forget(particles, draft, reading)
-        conditioned = _conditioned(draft, reading) if self.guided else None
-        ahead = reading.log_likelihood(draft.centers) if conditioned is None else conditioned.log_likelihood
-        ahead = jnp.where(draft.fresh, ahead, 0.0)
-        carried = (particles.values, draft.centers, draft.roots, conditioned, ahead)
-        choice = resample(_weighed(Particles(carried, particles.log_weights, particles.valid), ahead))
+        particles = _without_score(particles, noise, observation)
+        conditioned = _conditioned(noise, observation) if self.guided else None
+        ahead = observation.log_likelihood(noise.centers) if conditioned is None else conditioned.log_likelihood
+        ahead = jnp.where(noise.fresh, ahead, 0.0)
+        carried = (particles.values, noise.centers, noise.roots, conditioned, ahead)
+        choice = resample(_add_log_likelihood(Particles(carried, particles.log_weights, particles.valid), ahead))
         values, centers, roots, conditioned, ahead = choice.particles.values
         log_weights = jnp.maximum(choice.particles.log_weights - ahead, NOTHING)
         particles = Particles(values, log_weights, choice.particles.valid)
-        draft = Draft(centers, roots, draft.normals, draft.fresh)
+        noise = MotionNoise(centers, roots, noise.normals, noise.fresh)
         if conditioned is not None:
-            return Weighed(_guide(particles, draft, conditioned, reading), _used(draft), choice)
-        drawn = jax.vmap(lambda c, r, n: retract(c, matmul(r, n)))(centers, roots, draft.normals)
-        particles = _adopt(particles, draft, drawn, reading)
-        return Weighed(_weighed(particles, reading.log_likelihood(particles.values)), _used(draft), choice)
+            return Weighted(_move_conditioned(particles, noise, conditioned, observation), _mark_used(noise), choice)
+        drawn = jax.vmap(lambda c, r, n: retract(c, matmul(r, n)))(centers, roots, noise.normals)
+        particles = _replace_values(particles, noise, drawn, observation)
+        return Weighted(
+            _add_log_likelihood(particles, observation.log_likelihood(particles.values)), _mark_used(noise), choice
+        )
 
 
 def score(log_density: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Zeros with the derivative of a log density: what `f - stop_gradient(f)` is, at no cost where nothing is derived.
+    """Zeros with the derivative of a log density: ``f - stop_gradient(f)``, at no cost without differentiation.
 
     Example:
         >>> import jax, jaxloc as jl
@@ -257,14 +273,14 @@ class _Conditioned(eqx.Module):
     covariance: Array
 
 
-def _conditioned(draft: Draft, reading: Reading) -> _Conditioned:
-    return jax.vmap(lambda center, root: _condition(reading, center, root))(draft.centers, draft.roots)
+def _conditioned(noise: MotionNoise, observation: Observation) -> _Conditioned:
+    return jax.vmap(lambda center, root: _condition(observation, center, root))(noise.centers, noise.roots)
 
 
-def _condition(reading: Reading, center: Any, root: Array) -> _Conditioned:
-    expected, jacobian = reading.sensor.linearize(center, reading.measurement)
-    residual, mask = innovation(expected, reading.measurement, reading.valid)
-    covariance = mask_covariance(reading.sensor.covariance(center, reading.measurement), mask)
+def _condition(observation: Observation, center: Any, root: Array) -> _Conditioned:
+    expected, jacobian = observation.sensor.linearize(center, observation.measurement)
+    residual, mask = innovation(expected, observation.measurement, observation.valid)
+    covariance = mask_covariance(observation.sensor.covariance(center, observation.measurement), mask)
     jacobian = jnp.where(mask[:, None], jacobian, 0.0)
     across = matmul(jacobian, root)  # (H L): of the measurement by the normal numbers
     noise_root = cholesky(covariance)
@@ -278,57 +294,59 @@ def _condition(reading: Reading, center: Any, root: Array) -> _Conditioned:
     return _Conditioned(log_likelihood, mean, narrowed, residual, jacobian, mask, covariance)
 
 
-def _guide(particles: Particles, draft: Draft, conditioned: _Conditioned, reading: Reading) -> Particles:
+def _move_conditioned(
+    particles: Particles, noise: MotionNoise, conditioned: _Conditioned, observation: Observation
+) -> Particles:
     def move(center, mean, root, normal):
         delta = mean + matmul(root, normal)
         return retract(center, delta), delta
 
-    moved, deltas = jax.vmap(move)(draft.centers, conditioned.mean, conditioned.root, draft.normals)
-    particles = _adopt(particles, draft, moved, reading)
+    moved, deltas = jax.vmap(move)(noise.centers, conditioned.mean, conditioned.root, noise.normals)
+    particles = _replace_values(particles, noise, moved, observation)
 
     def linear(c, delta):
         return log_normal(c.residual - matmul(c.jacobian, delta), c.covariance, c.mask)
 
-    # What the linear model promised, less what it said of the place drawn: the reading itself says that now.
-    promised = conditioned.log_likelihood - jax.vmap(linear)(conditioned, deltas)
-    promised = promised if reading.pathwise else lax.stop_gradient(promised)
-    found = reading.log_likelihood(particles.values) + jnp.where(draft.fresh, promised, 0.0)
-    return _weighed(particles, found)
+    # Predictive likelihood over the linearized likelihood at the sample, for which the exact one stands in.
+    ratio = conditioned.log_likelihood - jax.vmap(linear)(conditioned, deltas)
+    ratio = ratio if observation.pathwise else lax.stop_gradient(ratio)
+    found = observation.log_likelihood(particles.values) + jnp.where(noise.fresh, ratio, 0.0)
+    return _add_log_likelihood(particles, found)
 
 
-def _log_density(draft: Draft, values: Any) -> Array:
-    """Of the motion that a draft tells of, at values held fixed."""
+def _log_density(noise: MotionNoise, values: Any) -> Array:
+    """Log density of the motion whose noise is given, at values held fixed."""
 
     def one(center, root, value):
         mask = jnp.ones(root.shape[:1], bool)
         return log_normal(local(center, value), matmul(root, root.T), mask)
 
-    return jax.vmap(one)(draft.centers, draft.roots, lax.stop_gradient(values))
+    return jax.vmap(one)(noise.centers, noise.roots, lax.stop_gradient(values))
 
 
-def _forget(particles: Particles, draft: Draft, reading: Reading) -> Particles:
-    """Particles without the score of the draws that are about to be replaced."""
-    if reading.pathwise:
+def _without_score(particles: Particles, noise: MotionNoise, observation: Observation) -> Particles:
+    """Particles without the score of the samples that are about to be replaced."""
+    if observation.pathwise:
         return particles
-    scores = jnp.where(draft.fresh, score(_log_density(draft, particles.values)), 0.0)
+    scores = jnp.where(noise.fresh, score(_log_density(noise, particles.values)), 0.0)
     return Particles(particles.values, particles.log_weights - scores, particles.valid)
 
 
-def _adopt(particles: Particles, draft: Draft, values: Any, reading: Reading) -> Particles:
-    """Particles at new places, with the score of having been drawn there."""
-    if reading.pathwise:
-        return Particles(_where(draft.fresh, values, particles.values), particles.log_weights, particles.valid)
+def _replace_values(particles: Particles, noise: MotionNoise, values: Any, observation: Observation) -> Particles:
+    """Particles with new values, and the score of these samples in their weights."""
+    if observation.pathwise:
+        return Particles(tree.where(noise.fresh, values, particles.values), particles.log_weights, particles.valid)
     values = lax.stop_gradient(values)
-    scores = jnp.where(draft.fresh, score(_log_density(draft, values)), 0.0)
-    return Particles(_where(draft.fresh, values, particles.values), particles.log_weights + scores, particles.valid)
+    scores = jnp.where(noise.fresh, score(_log_density(noise, values)), 0.0)
+    return Particles(tree.where(noise.fresh, values, particles.values), particles.log_weights + scores, particles.valid)
 
 
-def _weighed(particles: Particles, log_likelihood: Array) -> Particles:
+def _add_log_likelihood(particles: Particles, log_likelihood: Array) -> Particles:
     log_weights = jnp.maximum(particles.log_weights + log_likelihood, NOTHING)
     return Particles(particles.values, jnp.where(particles.valid, log_weights, NOTHING), particles.valid)
 
 
-def _drafted(motion: Motion, values: Any, control: Any, key: Array) -> Drawn:
+def _sample(motion: Motion, values: Any, control: Any, key: Array) -> Sampled:
     dimension = tangent_dimension(_first(values))
     normals = _normals(dimension, values, key)
 
@@ -337,18 +355,18 @@ def _drafted(motion: Motion, values: Any, control: Any, key: Array) -> Drawn:
         return retract(center, matmul(root, normal)), center, root
 
     moved, centers, roots = jax.vmap(move)(values, normals)
-    draft = Draft(centers, roots, normals, jnp.ones((), bool))
-    return Drawn(moved, draft, _log_density(draft, moved))
+    noise = MotionNoise(centers, roots, normals, jnp.ones((), bool))
+    return Sampled(moved, noise, _log_density(noise, moved))
 
 
-def _no_draft(values: Any) -> Draft:
+def _unused_noise(values: Any) -> MotionNoise:
     size, dimension = jax.tree.leaves(values)[0].shape[0], tangent_dimension(_first(values))
     zeros = jnp.zeros((size, dimension), dtype_of(values))
-    return Draft(values, jnp.zeros((size, dimension, dimension), zeros.dtype), zeros, jnp.zeros((), bool))
+    return MotionNoise(values, jnp.zeros((size, dimension, dimension), zeros.dtype), zeros, jnp.zeros((), bool))
 
 
-def _used(draft: Draft) -> Draft:
-    return Draft(draft.centers, draft.roots, draft.normals, jnp.zeros((), bool))
+def _mark_used(noise: MotionNoise) -> MotionNoise:
+    return MotionNoise(noise.centers, noise.roots, noise.normals, jnp.zeros((), bool))
 
 
 def _normals(dimension: int, values: Any, key: Array) -> Array:
@@ -359,7 +377,3 @@ def _normals(dimension: int, values: Any, key: Array) -> Array:
 
 def _first(values: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[0], values)
-
-
-def _where(condition: Array, new: Any, old: Any) -> Any:
-    return tree.where(condition, new, old)

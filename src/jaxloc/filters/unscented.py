@@ -1,4 +1,4 @@
-"""Sigma-point filters: the models are evaluated at a few points that share the moments of the state."""
+"""Unscented, cubature and Gauss-Hermite Kalman filters (sigma-point filters)."""
 
 import itertools
 import math
@@ -17,10 +17,10 @@ from jaxloc.beliefs import Motion, Sensor
 from jaxloc.beliefs.models import innovation
 from jaxloc.beliefs.square_root import cholesky, product
 from jaxloc.filters.interface import GaussianState
-from jaxloc.filters.kalman import GaussianFilter, Reading, Spread, noise_root
+from jaxloc.filters.kalman import GaussianFilter, Innovation, JointCovariance, noise_root
 from jaxloc.poses import is_flat, local, retract
 
-_MEAN_STEPS = 3  # of the intrinsic mean on a manifold; the error shrinks as the square of the spread each time
+_MEAN_STEPS = 3  # of the intrinsic mean on a manifold; the error is squared each time
 
 
 class Points(NamedTuple):
@@ -38,11 +38,11 @@ class Points(NamedTuple):
 
 
 class Rule(eqx.Module):
-    """Where sigma points lie, and what they weigh."""
+    """A sigma-point rule: offsets and weights."""
 
     @abstractmethod
     def points(self, size: int) -> Points:
-        """The points for a state with so many directions."""
+        """The points for a tangent space of some dimension."""
 
 
 class Unscented(Rule):
@@ -50,12 +50,12 @@ class Unscented(Rule):
 
     The default (alpha 1, beta 0, ``kappa = max(3 - d, 0)``) matches the normal's kurtosis along each axis up to three
     dimensions and has no negative weight. A negative central weight of the covariance is taken out of its root by a
-    downdate that never fails, but rounds: keep alpha near one in float32.
+    downdate, which is always defined but amplifies rounding: keep alpha near one in float32.
 
     Args:
-        alpha: spread of the points.
+        alpha: scale of the offsets.
         beta: correction of the central weight of the covariance; 2 is best for a normal and small alpha.
-        kappa: secondary spread; None for ``max(3 - d, 0)``.
+        kappa: secondary scale; None for ``max(3 - d, 0)``.
 
     References:
         Julier and Uhlmann, Proc. IEEE 2004; Wan and van der Merwe, 2001, eq. 15 [T-57].
@@ -72,11 +72,11 @@ class Unscented(Rule):
 
     def points(self, size: int) -> Points:
         """2 d + 1 points."""
-        spread = self.alpha**2 * (size + (max(3 - size, 0) if self.kappa is None else self.kappa))
-        if spread <= 0:
-            raise ValueError(f"Unscented needs alpha^2 (d + kappa) > 0; it got {spread} for d = {size}.")
-        corners = math.sqrt(spread) * np.eye(size)
-        weights = np.r_[1.0 - size / spread, np.full(2 * size, 0.5 / spread)]
+        scale = self.alpha**2 * (size + (max(3 - size, 0) if self.kappa is None else self.kappa))
+        if scale <= 0:
+            raise ValueError(f"Unscented needs alpha^2 (d + kappa) > 0; it got {scale} for d = {size}.")
+        corners = math.sqrt(scale) * np.eye(size)
+        weights = np.r_[1.0 - size / scale, np.full(2 * size, 0.5 / scale)]
         extra = np.r_[1.0 - self.alpha**2 + self.beta, np.zeros(2 * size)]
         return Points(np.concatenate([np.zeros((1, size)), corners, -corners]), weights, weights + extra)
 
@@ -130,14 +130,14 @@ class GaussHermite(Rule):
 class SigmaPointFilter(GaussianFilter):
     """Unscented, cubature or Gauss-Hermite Kalman filter in square-root form, on vectors, poses, or any pytree of them.
 
-    Points are ``retract(mean, S u_i)``; the mean of their images is intrinsic on manifolds. They are drawn again from
-    the prediction before each update. Noise is added in the tangent space of the image.
+    Points are ``retract(mean, S u_i)``; the mean of their images is intrinsic on manifolds. New points are
+    taken from the prediction before each update. Noise is added in the tangent space of the image.
 
     Args:
         motion: how the state moves.
         sensor: what is measured.
         rule: `Unscented`, `Cubature` or `GaussHermite`.
-        gate: probability that a right measurement passes; None for no gate.
+        gate: probability that a measurement from the model passes; None for no gate.
 
     References:
         Van der Merwe and Wan, "The square-root unscented Kalman filter", ICASSP 2001; Hauberg, Lauze and Pedersen,
@@ -158,27 +158,27 @@ class SigmaPointFilter(GaussianFilter):
     rule: Rule = eqx.field(default_factory=Unscented)
     gate: float | None = eqx.field(static=True, default=None)
 
-    def move(self, state: GaussianState, control: Any) -> Spread:
-        """By the images of the points under the motion."""
+    def predict_joint(self, state: GaussianState, control: Any) -> JointCovariance:
+        """By the motion evaluated at the points."""
         noise = cholesky(self.motion.covariance(state.mean, control))
-        return self._spread(lambda x: self.motion.move(x, control), state, noise, None)
+        return self._joint(lambda x: self.motion.move(x, control), state, noise, None)
 
-    def read(self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]) -> Reading:
-        """By the images of the points under the sensor."""
+    def innovation(self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]) -> Innovation:
+        """By the sensor evaluated at the points."""
         expected = self.sensor.expect(state.mean, measurement)
         _, mask = innovation(expected, measurement, valid)
         noise, mask = noise_root(self.sensor.covariance(state.mean, measurement), mask)
-        spread = self._spread(lambda x: self.sensor.expect(x, measurement), state, noise, mask)
-        residual, mask = innovation(spread.mean, measurement, mask)
-        return Reading(spread, jnp.where(mask, residual, 0.0), mask)
+        joint = self._joint(lambda x: self.sensor.expect(x, measurement), state, noise, mask)
+        residual, mask = innovation(joint.mean, measurement, mask)
+        return Innovation(joint, jnp.where(mask, residual, 0.0), mask)
 
-    def _spread(
+    def _joint(
         self,
         function: Callable[[Any], Any],
         state: GaussianState,
         noise: Float[Array, "m m"],
         mask: Bool[Array, " m"] | None,
-    ) -> Spread:
+    ) -> JointCovariance:
         root = state.covariance_sqrt
         points = self.rule.points(root.shape[0])
         deltas = product(jnp.asarray(points.offsets, root.dtype), root.T)
@@ -187,14 +187,14 @@ class SigmaPointFilter(GaussianFilter):
         if mask is not None:
             deviations = jnp.where(mask[None, :], deviations, 0.0)
         scale = jnp.asarray(np.sqrt(np.abs(points.weights_covariance)), root.dtype)[:, None]
-        image, source = (scale * deviations).T, (scale * deltas).T
+        after, before = (scale * deviations).T, (scale * deltas).T
         removed = None
         if points.weights_covariance[0] < 0.0:
-            removed = jnp.concatenate([image[:, 0], source[:, 0]])
-            image, source = image[:, 1:], source[:, 1:]
-        filler = jnp.zeros((source.shape[0], noise.shape[0]), root.dtype)
-        image, source = jnp.concatenate([image, noise], axis=1), jnp.concatenate([source, filler], axis=1)
-        return Spread(mean, image, source, removed)
+            removed = jnp.concatenate([after[:, 0], before[:, 0]])
+            after, before = after[:, 1:], before[:, 1:]
+        filler = jnp.zeros((before.shape[0], noise.shape[0]), root.dtype)
+        after, before = jnp.concatenate([after, noise], axis=1), jnp.concatenate([before, filler], axis=1)
+        return JointCovariance(mean, after, before, removed)
 
 
 def intrinsic_mean(values: Any, weights: Float[Array, " k"]) -> tuple[Any, Float[Array, "k d"]]:

@@ -156,10 +156,10 @@ def steps(log: Any, grid: OccupancyMap, start: SE2 | None = None, config: Config
     filt = make_filter(log, grid, config)
     key_start, key_run = jax.random.split(jax.random.key(config.seed))
     if start is None:
-        state = filt.start_globally(config.num_particles_global, key=key_start)
+        state = filt.init_globally(config.num_particles_global, key=key_start)
     else:
         sigmas = jnp.array([config.start_translation, config.start_translation, config.start_rotation])
-        state = filt.start_near(Gaussian(start, jnp.diag(sigmas**2)), config.num_particles, key=key_start)
+        state = filt.init_near(Gaussian(start, jnp.diag(sigmas**2)), config.num_particles, key=key_start)
     used = select_scans(log.odometry, config.min_translation, config.min_rotation)
     done, streak, last = 0, 0, None
     for chunk in np.split(used, range(config.chunk, len(used), config.chunk)):

@@ -1,6 +1,6 @@
-"""Jacobians of compound planar poses in their parameters (x, y, theta), as Kelly writes them.
+"""Jacobians of compound planar poses in their parameters (x, y, theta), after Kelly.
 
-They differ from the tangents of the rest of jaxloc: a perturbation here adds to x, y and theta in the outer frame. Of
+They differ from the tangents of the rest of jaxloc: a perturbation here is added to x, y and theta. Of
 the compound ``c = a @ b`` the left Jacobian is ``dc/da``, the right one ``dc/db``; the inverse Jacobian is that of
 ``a^-1``.
 
@@ -48,7 +48,7 @@ def right_jacobian(a: SE2, b: SE2) -> Float[Array, "3 3"]:
 
     Args:
         a: pose T_i_j.
-        b: pose T_j_k (its value does not matter; it is named for symmetry).
+        b: pose T_j_k (its value has no influence).
 
     Returns:
         The rotation of ``a``, bordered by one.

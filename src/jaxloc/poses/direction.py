@@ -17,9 +17,9 @@ _SWITCH = 1e-2
 
 
 class Direction(eqx.Module):
-    """A unit vector: where a translation of unknown length points, a bearing, the normal of a plane.
+    """A unit vector on the sphere: a bearing, a plane normal, or a translation of unknown length.
 
-    It moves along great circles: ``retract(d) = cos|d| v + sin|d| / |d| B d`` with the orthonormal tangents B of
+    Retraction is along great circles: ``retract(d) = cos|d| v + sin|d| / |d| B d`` with the orthonormal tangents B of
     `basis`.
 
     Attributes:
@@ -42,7 +42,7 @@ class Direction(eqx.Module):
 
     @staticmethod
     def from_vector(vector: Any) -> "Direction":
-        """Direction of a vector of any length; of one without length, or not finite: z."""
+        """Direction of a vector of any length; the z axis for zero or non-finite vectors."""
         (vector,) = as_floats(vector)
         largest = jnp.max(jnp.abs(vector))
         good = jnp.isfinite(largest) & (largest > 0)
@@ -74,11 +74,11 @@ class Direction(eqx.Module):
         squared = jnp.sum(delta * delta)
         turned = (1.0 - squared * series.versine(squared)) * self.vector
         turned = turned + series.sinc(squared) * matmul(self.basis(), delta)
-        # One Newton step keeps the length at one over any number of moves.
+        # One Newton step keeps the length at one over any number of retractions.
         return Direction(turned * (1.5 - 0.5 * jnp.sum(turned * turned)))
 
     def local(self, other: "Direction") -> Float[Array, "2"]:
-        """The tangent that turns this direction into the other; of the opposite one, half a turn along the first."""
+        """The tangent from this direction to the other; for the opposite one, half a turn along the first tangent."""
         side, along = matmul(self.basis().T, other.vector), jnp.sum(self.vector * other.vector)
         squared = jnp.sum(side * side)
         near = (squared < _SWITCH) & (along > 0)

@@ -1,4 +1,4 @@
-"""What every pose and rotation can do: the interface of a matrix Lie group."""
+"""Interface of matrix Lie groups: rotations and poses."""
 
 from abc import abstractmethod
 from typing import Any
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 
 def as_floats(*values: Any) -> list[Array]:
-    """The values as arrays of one floating dtype: that of the arrays among them, else the default."""
+    """The values as arrays of one floating-point dtype: that of the arrays among them, else the default."""
     dtype = jnp.result_type(*values, 1.0)
     return [jnp.asarray(value, dtype) for value in values]
 
@@ -42,7 +42,7 @@ class Group(eqx.Module):
 
     @abstractmethod
     def inverse(self) -> Any:
-        """The map back: ``T_b_a``."""
+        """The inverse ``T_b_a``."""
 
     @abstractmethod
     def log(self) -> Array:

@@ -1,4 +1,4 @@
-"""Moving any pytree along a flat tangent vector: poses and directions by their own rules, arrays by addition."""
+"""Retraction and local coordinates of any pytree: poses and directions on their manifolds, arrays by addition."""
 
 from typing import Any
 
@@ -44,7 +44,9 @@ def tangent_dimension(value: Any) -> int:
 
 
 def tangent_labels(value: Any) -> tuple[str, ...]:
-    """A name for each entry of the tangent vector: the path in the pytree and the direction.
+    """Name of each entry of the tangent vector, in order: the path in the pytree and the direction.
+
+    Covariances of a state or measurement have this order. (JAX sorts the entries of a dict by key.)
 
     Example:
         >>> import jaxloc as jl
@@ -75,14 +77,14 @@ def retract(value: Any, delta: Float[Array, " d"]) -> Any:
     """The value moved along a tangent: ``T @ exp(d)`` for poses (also stacked ones), a sum for arrays.
 
     Args:
-        value: any pytree; leaves that are neither poses nor floating arrays stay as they are.
+        value: any pytree; leaves that are neither poses nor floating-point arrays are unchanged.
         delta: flat tangent in the order of the leaves; a pose takes (translation, rotation).
 
     Returns:
-        The same pytree, moved.
+        The moved pytree.
 
     Raises:
-        ValueError: the tangent has not the length `tangent_dimension`.
+        ValueError: the length of the tangent is not `tangent_dimension`.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -92,7 +94,7 @@ def retract(value: Any, delta: Float[Array, " d"]) -> Any:
     """
     needed = tangent_dimension(value)
     if delta.shape[0] != needed:
-        raise ValueError(f"The tangent has {delta.shape[0]} entries, but this value moves in {needed} directions.")
+        raise ValueError(f"The tangent has {delta.shape[0]} entries, but this value has {needed} degrees of freedom.")
     nodes, structure = jax.tree.flatten(value, is_leaf=_is_manifold)
     start, moved = 0, []
     for node in nodes:
@@ -110,10 +112,10 @@ def retract(value: Any, delta: Float[Array, " d"]) -> Any:
 
 
 def local(value: Any, other: Any) -> Float[Array, " d"]:
-    """The tangent that retracts one pytree to another: the inverse of `retract`.
+    """The tangent from one pytree to another: the inverse of `retract`.
 
     Args:
-        value: where the tangent is attached.
+        value: base of the tangent.
         other: a pytree of the same structure.
 
     Returns:
@@ -131,12 +133,12 @@ def local(value: Any, other: Any) -> Float[Array, " d"]:
         else:
             parts.append((b - a).reshape(-1))
     if not parts:
-        raise ValueError("The value holds neither poses nor floating arrays: it has no tangent.")
+        raise ValueError("The value holds neither poses nor floating-point arrays: it has no tangent.")
     return jnp.concatenate(parts)
 
 
 def is_flat(value: Any) -> bool:
-    """Whether a pytree holds no poses, so that all its tangent spaces are one.
+    """Whether a pytree holds no poses or directions, so that all its tangent spaces coincide.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -147,7 +149,7 @@ def is_flat(value: Any) -> bool:
 
 
 def carry(value: Any, delta: Float[Array, " d"], target: Any) -> Float[Array, "d d"]:
-    """Derivative of ``local(target, retract(value, delta + e))`` by e: takes tangents from one place to another.
+    """Derivative of ``local(target, retract(value, delta + e))`` by e: transports tangents and covariances.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl

@@ -1,18 +1,18 @@
-"""Planar poses (x, y, heading) as rows of host arrays: what readers and simulators compute before records are made."""
+"""Planar poses (x, y, heading) as rows of NumPy arrays, for readers and simulators on the host."""
 
 import numpy as np
 from jaxtyping import Float64
 
 
 def relative_poses(before: Float64[np.ndarray, "n 3"], after: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Motions (x, y, heading) from one pose to another: ``T_a^-1 T_b``, headings in [-pi, pi).
+    """Relative poses (x, y, heading): ``T_a^-1 T_b``, headings in [-pi, pi).
 
     Args:
         before: poses (x, y, heading), m and rad.
         after: poses in the same frame.
 
     Returns:
-        Each pose of ``after`` in the frame of its partner.
+        Each pose of ``after`` in the frame of that of ``before``.
 
     Example:
         >>> relative_poses(np.array([[1.0, 0.0, np.pi / 2]]), np.array([[1.0, 2.0, np.pi / 2]])).round(3).tolist()
@@ -25,11 +25,11 @@ def relative_poses(before: Float64[np.ndarray, "n 3"], after: Float64[np.ndarray
 
 
 def compose_poses(first: Float64[np.ndarray, "n 3"], then: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Poses after motions: ``T_a T_b``, the inverse of `relative_poses`.
+    """Compositions ``T_a T_b`` of poses and motions, the inverse of `relative_poses`.
 
     Args:
         first: poses (x, y, heading), m and rad.
-        then: motions in the frames of these.
+        then: motions, in the frames of ``first``.
 
     Returns:
         Poses; headings are not wrapped.
@@ -47,15 +47,15 @@ def compose_poses(first: Float64[np.ndarray, "n 3"], then: Float64[np.ndarray, "
 def dead_reckon(
     times: Float64[np.ndarray, " n"], twists: Float64[np.ndarray, "n 2"], at: Float64[np.ndarray, " t"]
 ) -> Float64[np.ndarray, "t 3"]:
-    """Poses reached by velocities that hold from their stamps to the next, exact on each arc.
+    """Dead reckoning: poses from piecewise constant velocities, exact on each arc.
 
     Args:
-        times: stamps of the velocities, s, increasing.
+        times: of the velocities, s, increasing.
         twists: forward velocity (m/s) and turn rate (rad/s).
-        at: moments asked for, s; the robot stands still before the first stamp.
+        at: times of the poses, s; the robot stands still before the first velocity.
 
     Returns:
-        (x, y, theta), from the pose at the first stamp as origin.
+        (x, y, theta), relative to the pose at the first time.
     """
     headings = np.r_[0.0, np.cumsum(twists[:-1, 1] * np.diff(times))]
     arcs = _arc(headings[:-1], twists[:-1], np.diff(times))
@@ -77,6 +77,6 @@ def _arc(headings: np.ndarray, twists: np.ndarray, seconds: np.ndarray) -> np.nd
 def interpolate_poses(
     times: Float64[np.ndarray, " n"], poses: Float64[np.ndarray, "n 3"], at: Float64[np.ndarray, " t"]
 ) -> Float64[np.ndarray, "t 3"]:
-    """Planar poses between stamps: straight lines, headings the short way round."""
+    """Linear interpolation of planar poses in time, of headings along the shorter arc."""
     headings = np.unwrap(poses[:, 2])
     return np.stack([np.interp(at, times, column) for column in (*poses[:, :2].T, headings)], axis=1)

@@ -1,4 +1,4 @@
-"""Poses in the plane."""
+"""SE(2): poses in the plane."""
 
 from typing import Any, ClassVar
 
@@ -34,7 +34,7 @@ class SE2(Group):
 
     @staticmethod
     def from_parts(rotation: SO2, translation: Float[Array, "2"]) -> "SE2":
-        """Pose of a rotation and a translation, without passing through an angle."""
+        """Pose of a rotation and a translation, without an angle in between."""
         pose = object.__new__(SE2)
         object.__setattr__(pose, "rotation", rotation)
         object.__setattr__(pose, "translation", translation)
@@ -52,7 +52,7 @@ class SE2(Group):
 
     @staticmethod
     def exp(xi: Float[Array, "3"]) -> "SE2":
-        """Pose reached by the constant twist (v_x, v_y, omega) in unit time."""
+        """Exponential map: the pose reached by the constant twist (v_x, v_y, omega) in unit time."""
         theta = xi[2]
         s = theta * theta
         a, b = series.sinc(s), theta * series.versine(s)
@@ -102,7 +102,7 @@ class SE2(Group):
         return self.rotation.angle()
 
     def log(self) -> Float[Array, "3"]:
-        """The twist that reaches this pose in unit time."""
+        """Logarithm: the twist that reaches this pose in unit time."""
         theta = self.theta
         linear = matmul(_inverse_mean_rotation(theta), self.translation)
         return jnp.concatenate([linear, theta[None]])
@@ -117,7 +117,7 @@ class SE2(Group):
         return self.compose(SE2.exp(delta))
 
     def inverse(self) -> "SE2":
-        """The map back."""
+        """The inverse."""
         rotation = self.rotation.inverse()
         return SE2.from_parts(rotation, -matmul(rotation.matrix(), self.translation))
 
@@ -137,12 +137,12 @@ class SE2(Group):
         return self.rotation.apply(points) + self.translation[None, :]
 
     def normalize(self) -> "SE2":
-        """The pose with its rotation made exact again."""
+        """The pose with its rotation normalized."""
         return SE2.from_parts(self.rotation.normalize(), self.translation)
 
 
 def _inverse_mean_rotation(theta: Float[Array, ""]) -> Float[Array, "2 2"]:
-    """Inverse of the mean of the rotations from 0 to theta, which turns a twist's velocity into a translation."""
+    """Inverse of the mean of the rotations from 0 to theta, which maps a twist's velocity to a translation."""
     diagonal = 1.0 - theta * theta * series.cotangent(theta * theta)
     half = 0.5 * theta
     return jnp.stack([jnp.stack([diagonal, half]), jnp.stack([-half, diagonal])])

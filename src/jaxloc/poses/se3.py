@@ -1,4 +1,4 @@
-"""Poses in space."""
+"""SE(3): poses in space."""
 
 from typing import Any, ClassVar
 
@@ -36,7 +36,7 @@ class SE3(Group):
 
     @staticmethod
     def from_matrix(matrix: Float[Array, "4 4"]) -> "SE3":
-        """Pose of a homogeneous matrix (its rotation is taken as it is; see `normalize`)."""
+        """Pose of a homogeneous matrix (its rotation is not orthonormalized; see `normalize`)."""
         return SE3(SO3(matrix[:3, :3]), matrix[:3, 3])
 
     @staticmethod
@@ -47,7 +47,7 @@ class SE3(Group):
 
     @staticmethod
     def exp(xi: Float[Array, "6"]) -> "SE3":
-        """Pose reached by the constant twist (v, omega) in unit time."""
+        """Exponential map: the pose reached by the constant twist (v, omega) in unit time."""
         v, omega = xi[:3], xi[3:]
         return SE3(SO3.exp(omega), matmul(SO3.left_jacobian(omega), v))
 
@@ -69,7 +69,7 @@ class SE3(Group):
         return self.translation.shape[:-1]
 
     def log(self) -> Float[Array, "6"]:
-        """The twist that reaches this pose in unit time."""
+        """Logarithm: the twist that reaches this pose in unit time."""
         omega = self.rotation.log()
         return jnp.concatenate([matmul(SO3.left_jacobian_inverse(omega), self.translation), omega])
 
@@ -83,7 +83,7 @@ class SE3(Group):
         return self.compose(SE3.exp(delta))
 
     def inverse(self) -> "SE3":
-        """The map back."""
+        """The inverse."""
         rotation = self.rotation.inverse()
         return SE3(rotation, -matmul(rotation.rotation_matrix, self.translation))
 
@@ -102,7 +102,7 @@ class SE3(Group):
         return self.rotation.apply(points) + self.translation[None, :]
 
     def normalize(self) -> "SE3":
-        """The pose with its rotation made orthonormal again."""
+        """The pose with its rotation orthonormalized."""
         return SE3(self.rotation.normalize(), self.translation)
 
 
@@ -111,7 +111,7 @@ def _block_triangular(diagonal: Float[Array, "3 3"], corner: Float[Array, "3 3"]
 
 
 def _translation_coupling(xi: Float[Array, "6"]) -> Float[Array, "3 3"]:
-    """How the rotation tangent moves the translation: the upper right block of the left Jacobian.
+    """Coupling of rotation and translation: the upper right block of the left Jacobian.
 
     References:
         Barfoot and Furgale, "Associating uncertainty with three-dimensional poses", T-RO 2014, eq. 102.

@@ -1,4 +1,4 @@
-"""The trigonometric coefficients of the exponential maps, exact and smooth through zero angle.
+"""Trigonometric coefficients of exponential maps, exact and smooth at zero angle.
 
 Each is an even function of the angle, so it takes the squared angle ``s``: no square root is differentiated at zero.
 Below ``s = 0.25`` a Taylor series is used (its truncation error is under 1e-17), above it the closed form; the argument

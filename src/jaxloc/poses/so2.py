@@ -1,4 +1,4 @@
-"""Rotations of the plane."""
+"""SO(2): rotations in the plane."""
 
 from typing import Any, ClassVar
 
@@ -10,7 +10,14 @@ from jaxloc.poses.lie_group import Group, as_floats
 
 
 class SO2(Group):
-    """A planar rotation, kept as cosine and sine of its counter-clockwise angle.
+    """A planar rotation, stored as cosine and sine of its counter-clockwise angle.
+
+    Make one from an angle by ``SO2.from_angle(angle)`` (rad): ``SO2(angle)`` fails, since the constructor takes the
+    cosine and the sine. `angle` returns the angle.
+
+    Attributes:
+        cos: cosine of the angle.
+        sin: sine of the angle.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -27,13 +34,13 @@ class SO2(Group):
 
     @staticmethod
     def from_angle(angle: Any) -> "SO2":
-        """Rotation by an angle in rad."""
+        """Rotation by an angle, rad, counter-clockwise."""
         (angle,) = as_floats(angle)
         return SO2(jnp.cos(angle), jnp.sin(angle))
 
     @staticmethod
     def identity(dtype: Any = float) -> "SO2":
-        """The rotation that does nothing."""
+        """The identity."""
         return SO2(jnp.ones((), dtype), jnp.zeros((), dtype))
 
     @staticmethod
@@ -43,7 +50,7 @@ class SO2(Group):
 
     @staticmethod
     def left_jacobian(xi: Float[Array, "1"]) -> Float[Array, "1 1"]:
-        """Planar rotations commute: one."""
+        """One, since planar rotations commute."""
         return jnp.ones((1, 1), xi.dtype)
 
     @property
@@ -60,11 +67,11 @@ class SO2(Group):
         return self.angle()[None]
 
     def compose(self, other: "SO2") -> "SO2":
-        """Rotation by both angles."""
+        """The product: rotation by the sum of both angles."""
         return SO2(self.cos * other.cos - self.sin * other.sin, self.sin * other.cos + self.cos * other.sin)
 
     def retract(self, delta: Float[Array, "1"]) -> "SO2":
-        """Rotation turned by delta."""
+        """The rotation perturbed by an angle delta."""
         return self.compose(SO2.exp(delta))
 
     def inverse(self) -> "SO2":
@@ -76,7 +83,7 @@ class SO2(Group):
         return jnp.stack([jnp.stack([self.cos, -self.sin]), jnp.stack([self.sin, self.cos])])
 
     def adjoint(self) -> Float[Array, "1 1"]:
-        """One: planar rotations commute."""
+        """One, since planar rotations commute."""
         return jnp.ones((1, 1), self.cos.dtype)
 
     def apply(self, points: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
@@ -84,11 +91,11 @@ class SO2(Group):
         return matmul(points, self.matrix().T)
 
     def normalize(self) -> "SO2":
-        """The nearest rotation, after rounding has crept in."""
+        """The rotation normalized, which removes accumulated rounding."""
         scale = 1.0 / jnp.sqrt(self.cos**2 + self.sin**2)
         return SO2(self.cos * scale, self.sin * scale)
 
 
 def wrap_angle(angle: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Angles brought to [-pi, pi), rad; the derivative is one."""
+    """Angles wrapped to [-pi, pi), rad; the derivative is one."""
     return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi

@@ -1,4 +1,4 @@
-"""Rotations of space."""
+"""SO(3): rotations in space."""
 
 from typing import Any, ClassVar
 
@@ -11,7 +11,7 @@ from jaxloc.poses.lie_group import Group, as_floats, skew
 
 
 class SO3(Group):
-    """A rotation of space, kept as its matrix, so that rotating points is one matrix product.
+    """A rotation in space, stored as its matrix, so that rotating points is one matrix product.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -27,12 +27,12 @@ class SO3(Group):
 
     @staticmethod
     def identity(dtype: Any = float) -> "SO3":
-        """The rotation that does nothing."""
+        """The identity."""
         return SO3(jnp.eye(3, dtype=dtype))
 
     @staticmethod
     def from_matrix(matrix: Float[Array, "3 3"]) -> "SO3":
-        """Rotation of an orthonormal matrix (taken as it is; see `normalize`)."""
+        """Rotation of an orthonormal matrix (not orthonormalized; see `normalize`)."""
         return SO3(matrix)
 
     @staticmethod
@@ -132,7 +132,7 @@ class SO3(Group):
         return jnp.stack([yaw, pitch, jnp.arctan2(roll_sin, roll_cos)])
 
     def compose(self, other: "SO3") -> "SO3":
-        """This rotation after the other."""
+        """The product of both rotations."""
         return SO3(matmul(self.rotation_matrix, other.rotation_matrix))
 
     def retract(self, delta: Float[Array, "3"]) -> "SO3":
@@ -140,7 +140,7 @@ class SO3(Group):
         return self.compose(SO3.exp(delta))
 
     def inverse(self) -> "SO3":
-        """The rotation back."""
+        """The inverse."""
         return SO3(self.rotation_matrix.T)
 
     def matrix(self) -> Float[Array, "3 3"]:
@@ -156,6 +156,6 @@ class SO3(Group):
         return matmul(points, self.rotation_matrix.T)
 
     def normalize(self) -> "SO3":
-        """A matrix one Newton step nearer to the orthonormal ones, after rounding has crept in."""
+        """The rotation orthonormalized by one Newton step, which removes accumulated rounding."""
         m = self.rotation_matrix
         return SO3(1.5 * m - 0.5 * matmul(m, matmul(m.T, m)))

@@ -1,4 +1,4 @@
-"""Poses with time stamps."""
+"""Trajectories: poses with time stamps, their interpolation, and dead reckoning."""
 
 from typing import Any
 
@@ -12,9 +12,9 @@ from jaxloc.poses.se3 import SE3
 
 
 class Trajectory(eqx.Module):
-    """Where a moving frame was, and when: a stack of poses ``T_world_body`` with increasing times.
+    """A trajectory: stacked poses ``T_world_body`` with increasing times.
 
-    Times count from the start of the recording: in float32, seconds since 1970 would be rounded to two minutes.
+    Give times relative to the start of the recording: float32 rounds seconds since 1970 to two minutes.
 
     Attributes:
         times: seconds.
@@ -62,7 +62,7 @@ class Trajectory(eqx.Module):
         return jax.vmap(lambda pose: pose.matrix())(self.poses)
 
     def relative(self) -> Any:
-        """The motions ``T_k_(k+1)`` between neighbours, stacked."""
+        """The motions ``T_k_(k+1)`` between successive poses, stacked."""
         return jax.vmap(lambda a, b: a.inverse() @ b)(self[:-1], self[1:])
 
     def length(self) -> Float[Array, ""]:
@@ -70,33 +70,33 @@ class Trajectory(eqx.Module):
         return jnp.sum(jnp.linalg.norm(jnp.diff(self.positions, axis=0), axis=1))
 
     def at(self, time: Float[Array, ""]) -> Any:
-        """The pose at a time, along the geodesic between its neighbours; clamped to the ends."""
+        """The pose at a time, along the geodesic between its neighbors; clamped to the ends."""
         after = jnp.clip(jnp.searchsorted(self.times, time), 1, len(self) - 1)
-        start, end = self.times[after - 1], self.times[after]
-        span = jnp.where(end > start, end - start, 1.0)
-        fraction = jnp.clip((time - start) / span, 0.0, 1.0)
+        first, last = self.times[after - 1], self.times[after]
+        span = jnp.where(last > first, last - first, 1.0)
+        fraction = jnp.clip((time - first) / span, 0.0, 1.0)
         return interpolate(self[after - 1], self[after], fraction)
 
 
-def chain(start: Any, motions: Any) -> Any:
-    """Poses reached by motions one after the other: dead reckoning.
+def chain(initial: Any, motions: Any) -> Any:
+    """Dead reckoning: poses reached by successive motions.
 
     Args:
-        start: pose ``T_world_0``.
+        initial: pose ``T_world_0``.
         motions: stacked ``T_k_(k+1)``, n of them.
 
     Returns:
-        The n + 1 stacked poses ``T_world_k``, the start among them [K-4].
+        The n + 1 stacked poses ``T_world_k``, the initial one included [K-4].
     """
 
     def step(pose: Any, motion: Any) -> Any:
         following = pose @ motion
         return following, following
 
-    _, rest = jax.lax.scan(step, start, motions)
-    return jax.tree.map(lambda first, others: jnp.concatenate([first[None], others]), start, rest)
+    _, rest = jax.lax.scan(step, initial, motions)
+    return jax.tree.map(lambda first, others: jnp.concatenate([first[None], others]), initial, rest)
 
 
 def interpolate(a: Any, b: Any, fraction: Float[Array, ""]) -> Any:
-    """The pose a fraction of the way along the geodesic from one pose to another."""
+    """Geodesic interpolation between two poses, at a fraction from 0 to 1."""
     return a.retract(fraction * a.local(b))

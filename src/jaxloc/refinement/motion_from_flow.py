@@ -1,15 +1,15 @@
-"""The velocity of a camera from the velocities of features in its image, with depth and without.
+"""Camera velocity from optical flow of features, with and without depth.
 
 A static point at ``(x, y)`` (normalized, x right, y down) and depth Z moves in the image of a camera with the twist
-(v, w), in the camera's own axes, by
+(v, w), camera axes, by
 
     ``flow = A v / Z + B w``,  ``A = [[-1, 0, x], [0, -1, y]]``,
     ``B = [[x y, -(1 + x^2), y], [1 + y^2, -x y, -x]]``.
 
-Depth and translation enter by their quotient only: twice the depth with twice the translation is the same image, so
-without depth a camera tells the direction of its translation, and its rotation. The part of a rotation does not know
-depth at all. Over a narrow field of view B is almost constant and looks like a translation before a wall: a wide one
-tells them apart.
+Depth and translation enter by their quotient only: twice the depth with twice the translation gives the same image, so
+that without depth the rotation and the direction of translation are observable. The rotational part does not depend on
+depth. Over a narrow field of view B is almost constant and similar to a translation before a wall; a wide one
+distinguishes them.
 
 References:
     A. Kelly, *Mobile Robotics*, lecture 9.2.4.3.1 and 9.2.4.3.3 [K-78, K-87...K-90]; Longuet-Higgins and Prazdny, "The
@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
 from jaxloc.poses import Direction
 from jaxloc.refinement.interaction_matrix import (
@@ -38,7 +39,6 @@ from jaxloc.refinement.interaction_matrix import (
 )
 from jaxloc.solvers import Estimate, GaussNewton, LevenbergMarquardt, Quadratic, Status, solve
 from jaxloc.solvers.cholesky import factor
-from jaxloc.solvers.least_squares import trusted
 from jaxloc.solvers.problem import is_quadratic, normal_equations
 
 __all__ = [
@@ -53,7 +53,7 @@ __all__ = [
     "twist_from_flow",
 ]
 
-_DIRECTIONS = 96  # half a sphere of starts, 15 degrees apart
+_DIRECTIONS = 96  # initial values on a half-sphere, 15 degrees apart
 
 
 @eqx.filter_jit
@@ -71,14 +71,14 @@ def twist_from_flow(
     Args:
         points: normalized coordinates (x right, y down).
         flow: their velocities, 1/s.
-        depth: along the optical axis, m, as stereo tells it; without it a camera cannot tell its speed.
+        depth: along the optical axis, m, for example by stereo; without it the speed is unobservable.
         sigma: standard deviation of a component of the flow, 1/s: a number or one a point.
-        valid: points that count. Numbers that are not finite, and depths that are not positive, never do.
+        valid: points that are used. Non-finite values and depths that are not positive never are.
         loss: robust kernel over the two components of a point.
 
     Returns:
-        Estimate of the twist "6" (v, w) in the camera's axes, m/s and rad/s. ``ok`` is False when the points leave a
-        direction open, as two points do.
+        Estimate of the twist "6" (v, w) in the camera's axes, m/s and rad/s. ``ok`` is False when the points do not
+        determine it, as two points.
 
     References:
         KELLY 9.2.4.3.1, 9.2.4.3.3 [K-78, K-87].
@@ -109,17 +109,17 @@ def rotation_from_flow(
     valid: Bool[Array, " n"] | None = None,
     loss: Any = Quadratic(),
 ) -> Estimate:
-    """Angular velocity of a camera that turns on the spot, or looks at things far away: depth has no part in it.
+    """Angular velocity of a camera under pure rotation or of a distant scene, independent of depth.
 
     Args:
         points: normalized coordinates.
         flow: their velocities, 1/s.
         sigma: standard deviation of a component of the flow, 1/s.
-        valid: points that count.
+        valid: points that are used.
         loss: robust kernel.
 
     Returns:
-        Estimate of the angular velocity "3", camera axes, rad/s; right only if the camera does not travel.
+        Estimate of the angular velocity "3", camera axes, rad/s; correct only without translation.
 
     References:
         KELLY 9.2.4.3.3: orientation change can be measured without knowing depth, "if you knew the motion was
@@ -148,20 +148,20 @@ def motion_from_flow(
 ) -> Estimate:
     """Direction of translation and angular velocity of a camera, from flow without depth.
 
-    Minimizes the flow across the lines to the focus of expansion, the depths eliminated; starts from the best of many
-    directions, each with the rotation that suits it.
+    Minimizes the flow across the lines to the focus of expansion, with the depths eliminated, from the best of many
+    initial directions, each with its best rotation.
 
     Args:
         points: normalized coordinates.
         flow: their velocities, 1/s.
         sigma: standard deviation of a component of the flow, 1/s.
-        valid: points that count; five at least.
+        valid: points that are used; five at least.
         loss: robust kernel.
 
     Returns:
         Estimate of `FreeMotion`; its covariance is in (tangent of the direction, rotation). The sign of the direction
-        is the one with most points ahead of the camera. ``ok`` is False when the flow does not tell, as that of a
-        camera that only turns.
+        is the one with most points in front of the camera. ``ok`` is False when the flow does not determine it, as
+        without translation.
 
     References:
         KELLY 9.2.4.3.3 [K-88, K-89, K-90]; Heeger and Jepson, "Subspace methods for recovering rigid motion", IJCV
@@ -184,10 +184,10 @@ def motion_from_flow(
     candidates = _half_sphere(flow.dtype)
     rotations, costs = jax.vmap(fixed.rotation_for)(candidates)
     best = jnp.argmin(costs)
-    start = FreeMotion(Direction(candidates[best]), rotations[best])
-    found = solve(problem, start, solver=LevenbergMarquardt())
-    behind = fixed.ahead(found.value) < 0
-    return _pointed(found, jnp.where(behind, -1.0, 1.0).astype(flow.dtype), found.value)
+    initial = FreeMotion(Direction(candidates[best]), rotations[best])
+    found = solve(problem, initial, solver=LevenbergMarquardt())
+    behind = fixed.excess_in_front(found.value) < 0
+    return _reverse_direction(found, jnp.where(behind, -1.0, 1.0).astype(flow.dtype), found.value)
 
 
 def _linear(problem: FlowOfTwist) -> Estimate:
@@ -198,26 +198,26 @@ def _linear(problem: FlowOfTwist) -> Estimate:
     normal = normal_equations(problem, start)
     root = factor(normal.hessian)
     ok = ~root.deficient
-    value = trusted(-root.solve(normal.gradient), ok)
+    value = tree.detach_unless(ok, -root.solve(normal.gradient))
     cost = 0.5 * jnp.sum(problem.residual(value) ** 2)
     status = jnp.where(ok, int(Status.CONVERGED), int(Status.RANK_DEFICIENT)).astype(int)
-    return Estimate(value, trusted(root.inverse(), ok), cost, ok, jnp.zeros((), int), status, normal.hessian)
+    return Estimate(value, tree.detach_unless(ok, root.inverse()), cost, ok, jnp.zeros((), int), status, normal.hessian)
 
 
-def _pointed(found: Estimate, sign: Float[Array, ""], value: FreeMotion) -> Estimate:
-    """The estimate with its direction turned round where the sign says so, the covariance in the tangent there."""
-    turned = Direction(sign * value.direction.vector)
-    change = matmul(turned.basis().T, sign * value.direction.basis())
+def _reverse_direction(found: Estimate, sign: Float[Array, ""], value: FreeMotion) -> Estimate:
+    """The estimate with its direction reversed for a negative sign, and the covariance in the new tangent."""
+    reversed_ = Direction(sign * value.direction.vector)
+    change = matmul(reversed_.basis().T, sign * value.direction.basis())
     size = found.covariance.shape[0]
     whole = jnp.eye(size, dtype=change.dtype).at[:2, :2].set(change)
-    motion = FreeMotion(turned, value.angular_velocity)
+    motion = FreeMotion(reversed_, value.angular_velocity)
     covariance = matmul(whole, matmul(found.covariance, whole.T))
     information = matmul(whole, matmul(found.information, whole.T))
     return eqx.tree_at(lambda e: (e.value, e.covariance, e.information), found, (motion, covariance, information))
 
 
 def _half_sphere(dtype: Any) -> Float[Array, "96 3"]:
-    """Directions spread evenly over the half that looks ahead: the other half has the same flow."""
+    """Directions evenly distributed over the forward half-sphere; the other half has the same flow."""
     index = jnp.arange(_DIRECTIONS, dtype=dtype)
     z = (index + 0.5) / _DIRECTIONS
     radius, angle = jnp.sqrt(1.0 - z * z), index * (math.pi * (3.0 - math.sqrt(5.0)))
@@ -225,7 +225,7 @@ def _half_sphere(dtype: Any) -> Float[Array, "96 3"]:
 
 
 def _usable(points: Array, flow: Array, sigma: Any, valid: Any) -> tuple[Array, Array, Array]:
-    """Points and flow as "2 n" with bad numbers replaced, and the whitening, zero for points that do not count."""
+    """Points and flow as "2 n" with non-finite values replaced, and the whitening, zero for masked points."""
     usable = jnp.all(jnp.isfinite(points), axis=1) & jnp.all(jnp.isfinite(flow), axis=1)
     usable = usable if valid is None else usable & valid
     sigmas = jnp.broadcast_to(jnp.asarray(sigma, flow.dtype), usable.shape)

@@ -15,23 +15,23 @@ from jaxloc.sensors.maps.distance_field import DistanceField, trace
 
 
 class BeamModel(Sensor):
-    """What each beam should read: the wall, something in front of it, nothing, or anything.
+    """Beam model of a laser scan: a mixture of hits, unexpected obstacles, missing returns and random readings.
 
     ``p(z | x) = z_hit N(z; z*, sigma^2) + z_short Exp(z; lambda | z < z*) + z_rand / z_max`` for ranges below
     ``z_max``; at it, the probability ``z_max_part + z_hit P(hit beyond z_max)``. The expected range ``z*`` is traced
-    through the distance field and differentiable in pose and map. Parts sum to one.
+    through the distance field and differentiable in pose and map. The weights of the mixture sum to one.
 
     Args:
-        field: of the map; its ceiling bounds the steps of the rays.
+        field: distance field of the map; its largest distance bounds the steps of rays.
         mount: ``T_robot_laser``.
-        sigma: of ranges to the walls, m.
-        z_hit: part of the beams that read the map's walls.
-        z_short: part that end at something in front of the wall.
-        z_max_part: part that read nothing; the rest is spread over all ranges.
-        short_rate: how fast unexpected obstacles become rarer with range, 1/m.
-        max_range: what the device reads where there is nothing, m.
-        independent_beams: how many beams the whole scan is worth (see `LikelihoodField`).
-        num_steps: steps of a ray.
+        sigma: standard deviation of ranges to obstacles of the map, m.
+        z_hit: weight of hits of the map's obstacles.
+        z_short: weight of unexpected obstacles in front of them.
+        z_max_part: weight of missing returns; the rest is uniform over all ranges.
+        short_rate: decay rate of unexpected obstacles with range, 1/m.
+        max_range: reading of the device without a return, m.
+        independent_beams: effective number of independent beams in a scan (see `LikelihoodField`).
+        num_steps: number of steps along a ray.
 
     References:
         Thrun, Burgard, Fox, *Probabilistic Robotics*, 2005, table 6.1; Hart, "Sphere tracing", The Visual Computer
@@ -82,7 +82,7 @@ class BeamModel(Sensor):
         self.num_steps = num_steps
 
     def expect(self, state: SE2, measurement: LaserScan) -> LaserScan:
-        """Ranges to the walls of the map; the greatest range where there is none."""
+        """Ranges to the obstacles of the map; the largest range where there is none."""
         pose = state @ self.mount
         ranges = trace(self.field, pose, measurement.angles, max_range=self.max_range, num_steps=self.num_steps)
         return scan_like(measurement, ranges)
@@ -92,7 +92,7 @@ class BeamModel(Sensor):
         return jnp.eye(measurement.ranges.shape[0], dtype=self.sigma.dtype) * self.sigma**2
 
     def log_prob(self, state: SE2, measurement: LaserScan, valid: Bool[Array, "*m"]) -> Float[Array, ""]:
-        """Log density of the scan at a pose; readings of at least `max_range` count as such, bad ones nothing."""
+        """Log density of the scan at a pose; readings beyond `max_range` are clipped, non-finite ones ignored."""
         ranges = measurement.ranges
         mask = valid & jnp.isfinite(ranges) & (ranges > SHORTEST)
         read = jnp.where(mask, jnp.minimum(ranges, self.max_range), 1.0)

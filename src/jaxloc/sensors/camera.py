@@ -1,4 +1,4 @@
-"""Cameras: points in front of a lens and the pixels where they appear."""
+"""Pinhole camera model with lens distortion: projection and unprojection."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from jaxloc.poses import SE3
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.lenses import Lens
 
-_NEAREST = 1e-6  # points nearer than this to the plane of the camera have no image, m
+_NEAREST = 1e-6  # least depth of points that are projected, m
 
 
 class Pinhole(eqx.Module):
@@ -90,7 +90,7 @@ class Pinhole(eqx.Module):
 
     @eqx.filter_jit
     def in_front(self, points: Float[Array, "n 3"]) -> Bool[Array, " n"]:
-        """Whether points have an image: ahead of the camera and where its lens is one-to-one."""
+        """Whether points are projected: in front of the camera and where its lens is one-to-one."""
         return self.in_front_components(points[:, 0], points[:, 1], points[:, 2])
 
     def in_front_components(
@@ -165,7 +165,7 @@ def kelly_projection(points: Float[Array, "n 3"], focal: Float[Array, ""]) -> Fl
         focal: focal length, m.
 
     Returns:
-        Image points "n 2" (x right, z up), m; zero for points that are not ahead of the center of projection.
+        Image points "n 2" (x right, z up), m; zero for points that are not in front of the center of projection.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl

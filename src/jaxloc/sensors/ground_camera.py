@@ -1,4 +1,4 @@
-"""A camera over flat ground: where a pixel looks, and where a point of the road appears."""
+"""Camera over a ground plane: projection of ground points and back-projection of pixels."""
 
 from typing import Any
 
@@ -11,18 +11,18 @@ from jaxloc.poses import SE3, SO3
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.camera import Pinhole
 
-_GRAZING = 1e-4  # rays that sink less than this by unit depth are taken not to meet the ground
+_GRAZING = 1e-4  # least slope of rays that intersect the ground
 
 
 class GroundCamera(eqx.Module):
-    """A camera that is fixed on a vehicle, over the plane it drives on.
+    """A camera fixed to a vehicle, with height, pitch and roll relative to the ground plane.
 
     The road frame has x forward, y left, z up, and its origin on the ground straight below the camera.
 
     Args:
         camera: intrinsics and lens.
         height: of the camera over the ground, m.
-        pitch: of the optical axis below the horizontal, rad: positive looks down.
+        pitch: of the optical axis below the horizontal, rad, positive downwards.
         roll: about the optical axis, clockwise seen from behind, rad: positive has the right side down.
 
     References:
@@ -60,13 +60,13 @@ class GroundCamera(eqx.Module):
     def homography(self) -> Float[Array, "3 3"]:
         """Homogeneous points of the ground (x forward, y left, m) to pixels of a camera without a lens [K-35].
 
-        It turns the plane over (left is counted to the left), so it is a matrix and no warp of `images.warps`.
+        It reverses orientation (y is to the left), so it is a matrix and not a warp of `images.warps`.
 
         Raises:
-            ValueError: the camera has a lens, which bends straight lines.
+            ValueError: the camera has a lens: straight lines are not preserved.
         """
         if self.camera.lens is not None:
-            raise ValueError("GroundCamera.homography: a lens bends lines; undistort the image first.")
+            raise ValueError("GroundCamera.homography: the camera has a lens; undistort the image first.")
         axes = self.axes()
         ground = jnp.stack([axes[0], axes[1], -self.height * axes[2]], axis=1)
         return matmul(self.camera.matrix(), ground)
@@ -83,29 +83,29 @@ class GroundCamera(eqx.Module):
         """Pixels (u right, v down) of points of the ground; the principal point where `sees_components` is false.
 
         Args:
-            x: m ahead, array of any shape.
-            y: m to the left, of the same shape.
+            x: forward, m, array of any shape.
+            y: left, m, of the same shape.
         """
         return self.camera.project_components(*self.camera_components(x, y))
 
     def sees_components(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
-        """Whether points of the ground are ahead of the camera, where its lens is one-to-one (not: in the image)."""
+        """Whether points of the ground are in front of the camera, where its lens is one-to-one (not: in the image)."""
         return self.camera.in_front_components(*self.camera_components(x, y))
 
     def to_ground_components(
         self, u: Float[Array, "*n"], v: Float[Array, "*n"]
     ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """Points of the ground (x ahead, y left, m) that pixels show; zero where `meets_ground_components` is false."""
+        """Points of the ground (x forward, y left, m) at pixels; zero where `meets_ground_components` is false."""
         toward, meets = self._rays(u, v)
         reach = jnp.where(meets, self.height / jnp.where(meets, -toward[2], 1.0), 0.0)
         return reach * toward[0], reach * toward[1]
 
     def meets_ground_components(self, u: Float[Array, "*n"], v: Float[Array, "*n"]) -> Bool[Array, "*n"]:
-        """Whether pixels show ground: they are below the horizon."""
+        """Whether rays through pixels intersect the ground: below the horizon."""
         return self._rays(u, v)[1]
 
     def vanishing_point(self, heading: Float[Array, ""]) -> Float[Array, "2"]:
-        """Pixel where lines of the ground meet that run in a direction.
+        """Vanishing point of lines on the ground in a direction, px.
 
         Args:
             heading: counter-clockwise from straight ahead, rad.
@@ -118,7 +118,7 @@ class GroundCamera(eqx.Module):
         return self.vanishing_point(jnp.zeros_like(self.pitch))[1]
 
     def _rays(self, u: Array, v: Array) -> tuple[list[Array], Array]:
-        """Directions in the road frame, and which of them sink to the ground."""
+        """Rays in the road frame, and whether they intersect the ground."""
         a, b = self.camera.normalize_components(u, v)
         axes = self.axes()
         toward = [axes[i, 0] * a + axes[i, 1] * b + axes[i, 2] for i in range(3)]

@@ -1,4 +1,4 @@
-"""How a robot moved between two moments, by its odometry: the control of a filter that wakes up with each reading."""
+"""Odometry increments as controls of a filter, with noise that grows with distance, turn and time."""
 
 from typing import Any
 
@@ -13,10 +13,10 @@ from jaxloc.sensors.landmarks import length
 
 
 class Increment(eqx.Module):
-    """A motion, and how long it took.
+    """An odometry increment.
 
     Attributes:
-        dt: s.
+        dt: duration, s.
         motion: T_before_after.
     """
 
@@ -25,20 +25,20 @@ class Increment(eqx.Module):
 
 
 class IncrementMotion(Motion):
-    """Dead reckoning whose variances grow with way, turn and time, so that two half steps err as a whole one does.
+    """Dead reckoning with variances proportional to distance, turn and time, so that they add up over partial steps.
 
-    The noise is a normal in the frame after the step::
+    The noise is normal in the frame after the step::
 
-        along, aside:  sigma^2 = drive^2 |s| + idle^2 dt,    side^2 |s| + idle^2 dt
+        along, across:  sigma^2 = drive^2 |s| + idle^2 dt,    side^2 |s| + idle^2 dt
         heading:       sigma^2 = turn_drive^2 |s| + turn_turn^2 |r| + turn_idle^2 dt
 
     Args:
-        drive: m at 1 m of way, along it.
-        side: m at 1 m of way, across it.
-        idle: m at 1 s.
-        turn_drive: rad at 1 m of way.
-        turn_turn: rad at a turn of 1 rad.
-        turn_idle: rad at 1 s.
+        drive: standard deviation along the motion, m, after 1 m.
+        side: standard deviation across the motion, m, after 1 m.
+        idle: standard deviation of the position, m, after 1 s.
+        turn_drive: standard deviation of the heading, rad, after 1 m.
+        turn_turn: standard deviation of the heading, rad, after a turn of 1 rad.
+        turn_idle: standard deviation of the heading, rad, after 1 s.
 
     References:
         Kelly, "Linearized error propagation in odometry", IJRR 2004.
@@ -72,18 +72,18 @@ class IncrementMotion(Motion):
         self.turn_drive, self.turn_turn, self.turn_idle = as_floats(turn_drive, turn_turn, turn_idle)
 
     def move(self, state: SE2, control: Increment) -> SE2:
-        """The pose moved by what odometry says."""
+        """The pose moved by the increment."""
         return state @ control.motion
 
     def covariance(self, state: SE2, control: Increment) -> Float[Array, "3 3"]:
-        """Of (along, aside, heading) in the frame after the step."""
+        """Covariance of (along, across, heading) in the frame after the step."""
         del state
-        way, turn = length(control.motion.translation), jnp.abs(control.motion.theta)
-        along = self.drive**2 * way + self.idle**2 * control.dt
-        aside = self.side**2 * way + self.idle**2 * control.dt
-        heading = self.turn_drive**2 * way + self.turn_turn**2 * turn + self.turn_idle**2 * control.dt
-        return jnp.diag(jnp.stack([along, aside, heading]))
+        distance, turn = length(control.motion.translation), jnp.abs(control.motion.theta)
+        along = self.drive**2 * distance + self.idle**2 * control.dt
+        across = self.side**2 * distance + self.idle**2 * control.dt
+        heading = self.turn_drive**2 * distance + self.turn_turn**2 * turn + self.turn_idle**2 * control.dt
+        return jnp.diag(jnp.stack([along, across, heading]))
 
     def linearize(self, state: SE2, control: Increment) -> tuple[SE2, Float[Array, "3 3"]]:
-        """The moved pose and the adjoint of the way back."""
+        """The moved pose and the adjoint of the inverse motion."""
         return self.move(state, control), control.motion.inverse().adjoint()

@@ -1,4 +1,4 @@
-"""Point landmarks in the plane: how far away they are, in which direction, and which is which."""
+"""Range and bearing measurements of point landmarks in the plane."""
 
 from typing import Any
 
@@ -13,16 +13,16 @@ from jaxloc.beliefs import Sensor
 from jaxloc.poses import SE2, SO2
 from jaxloc.poses.lie_group import as_floats
 
-_NEAREST = 1e-3  # m: closer than this no bearing means anything
+_NEAREST = 1e-3  # least range with a bearing, m
 
 
 class RangeBearing(eqx.Module):
-    """Where one landmark was seen from: the reading of a camera with bar codes, or of a laser that finds trees.
+    """A range and bearing measurement of one landmark.
 
     Attributes:
         range: m.
         bearing: direction in the frame of the sensor, counter-clockwise from its x axis.
-        landmark: which one it was: a row of the map.
+        landmark: index of the landmark: a row of the map.
     """
 
     range: Float[Array, ""]
@@ -31,11 +31,11 @@ class RangeBearing(eqx.Module):
 
 
 class DescribedReading(eqx.Module):
-    """Where a landmark was seen, and what it looks like: the reading of a camera that finds SIFT features.
+    """A range and bearing measurement with a descriptor, such as that of a SIFT feature.
 
     Attributes:
-        reading: range and bearing; ``landmark`` is -1 where only its looks say which one it was.
-        descriptor: "d" numbers that are alike whenever the landmark is the same.
+        reading: range and bearing; ``landmark`` is -1 where the landmark is identified by its descriptor.
+        descriptor: "d", similar for measurements of the same landmark.
     """
 
     reading: RangeBearing
@@ -72,12 +72,12 @@ class RangeBearingSensor(Sensor):
         self.mount = SE2.identity(dtype) if mount is None else mount
 
     def expect(self, state: Any, measurement: RangeBearing) -> RangeBearing:
-        """Range and bearing of that landmark from a pose, or a record with one."""
+        """Range and bearing of the landmark from a pose, or from a record with a pose."""
         sensor = pose_of(state) @ self.mount
         return observe(sensor, row(self.landmarks, measurement.landmark), measurement.landmark)
 
     def covariance(self, state: Any, measurement: RangeBearing) -> Float[Array, "2 2"]:
-        """Of (range, bearing)."""
+        """Covariance of (range, bearing)."""
         del state, measurement
         return jnp.diag(self.deviations**2)
 
@@ -99,7 +99,7 @@ def observe(sensor: SE2, landmark: Float[Array, "2"], index: Int[Array, ""]) -> 
 
 
 def locate(sensor: SE2, reading: RangeBearing) -> Float[Array, "2"]:
-    """Where a landmark stands in the world that was read so from T_world_sensor: the inverse of `observe`.
+    """Position in the world of a landmark measured from T_world_sensor: the inverse of `observe`.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -123,8 +123,8 @@ def locate_covariance(sensor: SE2, reading: RangeBearing, deviations: Float[Arra
     """
     ray = jnp.stack([reading.bearing.cos, reading.bearing.sin])
     axes = matmul(sensor.rotation.matrix(), jnp.stack([ray, jnp.stack([-ray[1], ray[0]])], axis=1))
-    spread = jnp.stack([deviations[0], deviations[1] * reading.range])
-    return matmul(axes * spread[None] ** 2, axes.T)
+    scaled = jnp.stack([deviations[0], deviations[1] * reading.range])
+    return matmul(axes * scaled[None] ** 2, axes.T)
 
 
 def polar_jacobian(reading: RangeBearing) -> Float[Array, "2 2"]:
@@ -145,20 +145,20 @@ def polar_jacobian(reading: RangeBearing) -> Float[Array, "2 2"]:
 def confusion(
     sensor: RangeBearingSensor, poses: SE2, readings: RangeBearing, valid: Bool[Array, " t"], *, limit: float = 20.0
 ) -> Float[Array, "k k"]:
-    """How badly each landmark explains the readings that bear another one's number: recordings do mix them up.
+    """Misfit of the measurements of each label to each landmark, to correct mislabeled recordings.
 
-    The best one-to-one assignment of its rows to its columns, as by SciPy's `linear_sum_assignment`, says which number
-    belongs to which landmark.
+    The best one-to-one assignment of its rows to its columns, as by SciPy's `linear_sum_assignment`, maps labels to
+    landmarks.
 
     Args:
         sensor: with the landmarks.
-        poses: T_world_robot, stacked, from a filter that refuses readings which do not fit.
+        poses: T_world_robot, stacked, from a gated filter.
         readings: stacked.
-        valid: which of them count.
-        limit: largest squared distance a single reading adds.
+        valid: mask of the readings.
+        limit: largest squared distance that one reading adds.
 
     Returns:
-        Mean of ``min(d^2, limit)`` over readings with number i, against landmark j; `limit` for numbers never read.
+        Mean of ``min(d^2, limit)`` of the readings with label i, relative to landmark j; `limit` for labels never read.
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxloc as jl
@@ -181,15 +181,15 @@ def confusion(
 
     safe, usable = jax.vmap(sanitize)(readings, valid)
     squared = jax.vmap(against_all)(poses, safe)
-    bears = (safe.landmark[:, None] == jnp.arange(count, dtype=safe.landmark.dtype)[None, :]) & usable[:, None]
-    weights = bears.astype(squared.dtype)
+    labeled = (safe.landmark[:, None] == jnp.arange(count, dtype=safe.landmark.dtype)[None, :]) & usable[:, None]
+    weights = labeled.astype(squared.dtype)
     total = jnp.sum(weights, axis=0)
     mean = matmul(weights.T, squared) / jnp.maximum(total, 1.0)[:, None]
     return jnp.where((total > 0)[:, None], mean, limit)
 
 
 def sanitize(reading: RangeBearing, valid: Bool[Array, ""]) -> tuple[RangeBearing, Bool[Array, ""]]:
-    """A reading with finite numbers, and whether it is one: replace bad numbers before the maths, mask after it."""
+    """A reading with non-finite values replaced, and whether it was valid and finite."""
     values = jnp.stack([reading.range, reading.bearing.cos, reading.bearing.sin])
     usable = valid & jnp.all(jnp.isfinite(values)) & (reading.range > 0.0)
     stand_in = jnp.ones_like(reading.range), SO2.identity(reading.range.dtype)

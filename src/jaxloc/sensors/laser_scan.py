@@ -4,19 +4,19 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-SHORTEST = 1e-3  # ranges up to here are no readings, m
+SHORTEST = 1e-3  # least valid range, m
 
 
 class LaserScan(eqx.Module):
-    """One sweep of a planar range finder.
+    """One scan of a planar laser range finder.
 
-    Its tangent holds the ranges alone: the directions are part of the device, and static.
+    Its tangent holds the ranges only: the directions of the beams are static.
 
     Args:
-        ranges: "b" (a stack of scans has leading axes), m; readings that are no finite number, or not positive, are
-            masked wherever the scan is used.
+        ranges: "b" (a stack of scans has leading axes), m; non-finite and nonpositive readings are masked wherever the
+            scan is used.
         angle_min: direction of the first beam, counter-clockwise from the device's x axis, rad.
-        angle_increment: from one beam to the next, rad.
+        angle_increment: between successive beams, rad.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -36,18 +36,18 @@ class LaserScan(eqx.Module):
         return self.angle_min + self.angle_increment * number
 
     def thin(self, num_beams: int) -> "LaserScan":
-        """At most so many beams, evenly spaced over the sweep; the last axis of a stack of scans is thinned."""
+        """A scan with at most a number of beams, evenly spaced; the last axis of a stack of scans is thinned."""
         size = self.ranges.shape[-1]
         if num_beams < 1:
             raise ValueError(f"thin got num_beams={num_beams}; a scan has at least one beam.")
         step = -(-size // min(num_beams, size))
         first = step // 2
-        start = self.angle_min + first * self.angle_increment
-        return LaserScan(self.ranges[..., first::step], start, step * self.angle_increment)
+        angle_min = self.angle_min + first * self.angle_increment
+        return LaserScan(self.ranges[..., first::step], angle_min, step * self.angle_increment)
 
 
 def beam_mask(scan: LaserScan, valid: Bool[Array, "*m"], max_range: Float[Array, ""]) -> Bool[Array, " b"]:
-    """Which beams hit something: valid, finite, positive and short of the greatest range.
+    """Mask of the beams with a return: valid, finite, positive and below the largest range.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -60,7 +60,7 @@ def beam_mask(scan: LaserScan, valid: Bool[Array, "*m"], max_range: Float[Array,
 
 
 def discount(mask: Bool[Array, " b"], independent_beams: Float[Array, ""]) -> Float[Array, ""]:
-    """What each beam counts where all together are worth `independent_beams` at most.
+    """Weight of each beam, so that all together count as at most `independent_beams`.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -72,5 +72,5 @@ def discount(mask: Bool[Array, " b"], independent_beams: Float[Array, ""]) -> Fl
 
 
 def scan_like(scan: LaserScan, ranges: Array) -> LaserScan:
-    """A scan with other ranges in the directions of the given one."""
+    """A scan with new ranges in the directions of the given one."""
     return LaserScan(ranges, scan.angle_min, scan.angle_increment)

@@ -1,4 +1,4 @@
-"""Lenses: how an ideal image point moves in the glass, and the way back.
+"""Lens distortion models (Brown-Conrady, Kannala-Brandt) and their inverses.
 
 Points are normalized image coordinates (x/z, y/z), given as two component arrays of any equal shape.
 """
@@ -19,30 +19,30 @@ _RAY_SAMPLES = 8
 
 
 class Lens(eqx.Module):
-    """A distortion of normalized image coordinates that leaves the axis in place."""
+    """Interface of lens distortions of normalized image coordinates; the optical axis is a fixed point."""
 
     @abstractmethod
     def distort(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """Where the lens puts ideal points."""
+        """Distorted points of ideal ones."""
 
     @abstractmethod
     def undistort(
         self, xd: Float[Array, "*n"], yd: Float[Array, "*n"]
     ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """The ideal points of distorted ones; first derivatives are exact in either mode."""
+        """Ideal points of distorted ones; first derivatives are exact, in forward and reverse mode."""
 
     @abstractmethod
     def in_domain(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
-        """Whether the lens is one-to-one from the axis out to these ideal points."""
+        """Whether the lens is one-to-one between the axis and these ideal points."""
 
     def can_undistort(self, xd: Float[Array, "*n"], yd: Float[Array, "*n"]) -> Bool[Array, "*n"]:
-        """Whether `undistort` has an answer: false outside the image of the lens's one-to-one region."""
+        """Whether `undistort` has converged: false outside the image of the one-to-one region of the lens."""
         x, y = self.undistort(xd, yd)
         return _converged(*_residual(self, x, y, xd, yd), xd, yd) & self.in_domain(x, y)
 
 
 class BrownConrady(Lens):
-    """Radial polynomial and decentering: the usual glass lens, in OpenCV's order of coefficients.
+    """Brown-Conrady model: radial (polynomial or rational) and decentering distortion, OpenCV's coefficients.
 
     ``x_d = x g + 2 p1 x y + p2 (r2 + 2 x^2)``, ``y_d = y g + p1 (r2 + 2 y^2) + 2 p2 x y`` with ``r2 = x^2 + y^2`` and
     ``g = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)``.
@@ -75,14 +75,14 @@ class BrownConrady(Lens):
             )
 
     def distort(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """Where the lens puts ideal points (clipped at 89.4 degrees off the axis)."""
+        """Distorted points of ideal ones (clipped at 89.4 degrees off the axis)."""
         k = [self.coefficients[i] for i in range(self.coefficients.size)]
         k1, k2, p1, p2 = k[:4]
         x, y = jnp.clip(x, -_FAR, _FAR), jnp.clip(y, -_FAR, _FAR)
         r2 = x * x + y * y
         gain = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k[4] if len(k) > 4 else k2))
         if len(k) == 8:
-            # A rational lens has poles far outside its image: stay finite there.
+            # A rational model has poles far outside its image: bounded there.
             gain = gain / jnp.maximum(1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])), 1e-3)
         cross = 2.0 * x * y
         return x * gain + p1 * cross + p2 * (r2 + 2.0 * x * x), y * gain + p1 * (r2 + 2.0 * y * y) + p2 * cross
@@ -91,9 +91,9 @@ class BrownConrady(Lens):
     def undistort(
         self, xd: Float[Array, "*n"], yd: Float[Array, "*n"]
     ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """The ideal points of distorted ones: a fixed number of damped Newton steps, then one implicit step.
+        """Ideal points of distorted ones: a fixed number of damped Newton steps, then one implicit step.
 
-        Outside the invertible region (`can_undistort`) the nearest point that was reached, with zero gradient.
+        Outside the invertible region (`can_undistort`) the last iterate, with zero gradient.
         """
         frozen, target_x, target_y = lax.stop_gradient((self, xd, yd))
 
@@ -106,14 +106,14 @@ class BrownConrady(Lens):
             damping = jnp.where(better, jnp.minimum(1.0, 4.0 * damping), 0.25 * damping)
             return jnp.where(better, new_x, x), jnp.where(better, new_y, y), damping
 
-        start = jnp.clip(target_x, -_FAR, _FAR), jnp.clip(target_y, -_FAR, _FAR)
-        fold = _determinant(frozen, *start) <= 0
-        start = tuple(jnp.where(fold, 0.0, component) for component in start)
-        x, y, _ = lax.fori_loop(0, _NEWTON_STEPS, improve, (*start, jnp.ones_like(xd)))
+        initial = jnp.clip(target_x, -_FAR, _FAR), jnp.clip(target_y, -_FAR, _FAR)
+        fold = _determinant(frozen, *initial) <= 0
+        initial = tuple(jnp.where(fold, 0.0, component) for component in initial)
+        x, y, _ = lax.fori_loop(0, _NEWTON_STEPS, improve, (*initial, jnp.ones_like(xd)))
         return _implicit_step(self, x, y, xd, yd)
 
     def in_domain(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
-        """Whether the lens is one-to-one from the axis out to these ideal points (it may fold beyond its image)."""
+        """Whether the lens is one-to-one between the axis and these ideal points (it may fold beyond its image)."""
         ok = (jnp.abs(x) < _FAR) & (jnp.abs(y) < _FAR)
         for i in range(1, _RAY_SAMPLES + 1):
             fraction = i / _RAY_SAMPLES
@@ -122,9 +122,9 @@ class BrownConrady(Lens):
 
 
 class KannalaBrandt(Lens):
-    """Fisheye lens: the image radius is a polynomial of the angle off the axis (OpenCV's ``fisheye`` model).
+    """Kannala-Brandt fisheye model: the image radius is a polynomial of the angle off the axis (OpenCV's ``fisheye``).
 
-    ``r_d = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`` with ``t = atan(r)``; the direction in the image is kept.
+    ``r_d = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`` with ``t = atan(r)``; directions in the image are unchanged.
 
     Args:
         coefficients: (k1, k2, k3, k4).
@@ -152,7 +152,7 @@ class KannalaBrandt(Lens):
             raise ValueError(f"KannalaBrandt got coefficients of shape {self.coefficients.shape}; give k1, k2, k3, k4.")
 
     def distort(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """Where the lens puts ideal points."""
+        """Distorted points of ideal ones."""
         r2 = x * x + y * y
         near, r = _safe_root(r2)
         on_axis = 1.0 + r2 * (self.coefficients[0] - 1.0 / 3.0)
@@ -163,7 +163,7 @@ class KannalaBrandt(Lens):
     def undistort(
         self, xd: Float[Array, "*n"], yd: Float[Array, "*n"]
     ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """The ideal points of distorted ones: Newton steps on the angle, kept in a bracket, then one implicit step."""
+        """Ideal points of distorted ones: bracketed Newton steps on the angle, then one implicit step."""
         frozen, target_x, target_y = lax.stop_gradient((self, xd, yd))
         near, radius = _safe_root(target_x * target_x + target_y * target_y)
 
@@ -175,13 +175,13 @@ class KannalaBrandt(Lens):
             inside = (newton >= low) & (newton <= high)
             return jnp.where(inside, newton, 0.5 * (low + high)), low, high
 
-        start = jnp.minimum(radius, _WIDEST), jnp.zeros_like(radius), jnp.full_like(radius, _WIDEST)
-        angle, _, _ = lax.fori_loop(0, _NEWTON_STEPS, improve, start)
+        initial = jnp.minimum(radius, _WIDEST), jnp.zeros_like(radius), jnp.full_like(radius, _WIDEST)
+        angle, _, _ = lax.fori_loop(0, _NEWTON_STEPS, improve, initial)
         gain = jnp.where(near, 1.0, jnp.tan(angle) / radius)
         return _implicit_step(self, target_x * gain, target_y * gain, xd, yd)
 
     def in_domain(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
-        """Whether the image radius grows from the axis out to these ideal points."""
+        """Whether the image radius increases between the axis and these ideal points."""
         angle = jnp.arctan(_safe_root(x * x + y * y)[1])
         ok = angle <= _WIDEST
         for i in range(1, _RAY_SAMPLES + 1):
@@ -200,7 +200,7 @@ def _floats(values: Any) -> Float[Array, " c"]:
 
 
 def _safe_root(square: Float[Array, "*n"]) -> tuple[Bool[Array, "*n"], Float[Array, "*n"]]:
-    """Where the square is so small that a series of two terms is exact, and the root elsewhere (one there)."""
+    """Mask of squares so small that a series of two terms is exact, and the root elsewhere (one there)."""
     near = square < float(jnp.finfo(square.dtype).eps) ** 0.5
     return near, jnp.sqrt(jnp.where(near, 1.0, square))
 
@@ -246,7 +246,7 @@ def _implicit_step(lens: Lens, x: Array, y: Array, xd: Array, yd: Array) -> tupl
     ex, ey = _residual(lens, x, y, xd, yd)
     (a, c), (b, d) = _jacobian(frozen, x, y)
     determinant = a * d - b * c
-    # Wider than `_converged`: this step may still finish the work of the last iteration.
+    # Wider than `_converged`: this step is one more iteration.
     close = (_norm(ex, ey) < 1e-6 * (1.0 + _norm(xd, yd))) & (determinant > 0)
     inverse = 1.0 / jnp.where(close, determinant, 1.0)
     step_x, step_y = inverse * (d * ex - b * ey), inverse * (a * ey - c * ex)

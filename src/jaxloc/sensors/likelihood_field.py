@@ -13,20 +13,20 @@ from jaxloc.sensors.maps.distance_field import DistanceField, trace
 
 
 class LikelihoodField(Sensor):
-    """How near the end points of beams come to the obstacles of a map, whatever lies between.
+    """Likelihood field model of a laser scan: distances of beam end points to the obstacles of a map.
 
     ``log p(z | x) = c sum_b log(z_hit N(d_b; 0, sigma^2) + z_rand / z_max)``, with d_b the distance from the end point
-    of beam b to the nearest obstacle. Smooth in the pose, and one look-up a beam. Beams of one scan err together (the
-    map, what moved, the pose of the mount), and taking them as independent makes the belief far too sure: ``c`` counts
-    all beams as `independent_beams` at most.
+    of beam b to the nearest obstacle. Smooth in the pose, at one look-up per beam. Errors of the beams of one scan are
+    correlated (map, moving objects, mount), and treating them as independent makes the density overconfident: ``c``
+    counts all beams as at most `independent_beams`.
 
     Args:
         field: of the map.
         mount: ``T_robot_laser``.
-        sigma: spread of end points about the obstacles, m.
-        z_hit: part of the beams that end at obstacles of the map; the rest is spread over all ranges.
-        max_range: a beam that is at least so long hit nothing and counts nothing, m.
-        independent_beams: how many beams the whole scan is worth.
+        sigma: standard deviation of end points about the obstacles, m.
+        z_hit: weight of hits of the map's obstacles; the rest is uniform over all ranges.
+        max_range: longer beams have no return and are ignored, m.
+        independent_beams: effective number of independent beams in a scan.
 
     References:
         Thrun, Burgard, Fox, *Probabilistic Robotics*, 2005, table 6.3.
@@ -67,22 +67,22 @@ class LikelihoodField(Sensor):
         )
 
     def expect(self, state: SE2, measurement: LaserScan) -> LaserScan:
-        """Ranges to the walls of the map."""
+        """Ranges to the obstacles of the map."""
         pose = state @ self.mount
         return scan_like(measurement, trace(self.field, pose, measurement.angles, max_range=self.max_range))
 
     def covariance(self, state: SE2, measurement: LaserScan) -> Float[Array, "b b"]:
-        """Independent ranges with the spread of end points."""
+        """Independent ranges with the standard deviation of end points."""
         return jnp.eye(measurement.ranges.shape[0], dtype=self.sigma.dtype) * self.sigma**2
 
     def distances(self, state: SE2, measurement: LaserScan, mask: Bool[Array, " b"]) -> Float[Array, " b"]:
-        """From the end point of each beam to the nearest obstacle, m; masked beams end at the laser."""
+        """Distance from the end point of each beam to the nearest obstacle, m; masked beams end at the laser."""
         ranges, angles = jnp.where(mask, measurement.ranges, 0.0), measurement.angles
         x, y = self._in_robot(ranges * jnp.cos(angles), ranges * jnp.sin(angles))
         return self.field.lookup(*self.field.to_grid(state, x, y))
 
     def log_prob(self, state: SE2, measurement: LaserScan, valid: Bool[Array, "*m"]) -> Float[Array, ""]:
-        """Log density of the scan at a pose; beams that are masked count nothing."""
+        """Log density of the scan at a pose; masked beams are ignored."""
         mask = beam_mask(measurement, valid, self.max_range)
         scaled = self.distances(state, measurement, mask) / self.sigma
         hit = self.z_hit / (math.sqrt(2.0 * math.pi) * self.sigma) * jnp.exp(-0.5 * scaled**2)

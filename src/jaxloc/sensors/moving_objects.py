@@ -1,4 +1,4 @@
-"""Objects that a stereo camera sees moving: a place and a velocity in the world."""
+"""Sensor model of moving objects in stereo images: position and velocity in the world."""
 
 from typing import Any
 
@@ -13,15 +13,15 @@ from jaxloc.poses import SE3
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.stereo_rig import StereoRig
 
-_NEAREST = 1.0  # m: nearer states are measured as well as those
+_NEAREST = 1.0  # depth below which the noise no longer decreases, m
 
 
 class MovingObject(eqx.Module):
-    """A measurement of an object.
+    """A measurement of a moving object.
 
     Attributes:
         position: in the world, m.
-        velocity: against the world, m/s.
+        velocity: in the world, m/s.
     """
 
     position: Float[Array, "3"]
@@ -29,12 +29,12 @@ class MovingObject(eqx.Module):
 
 
 class MovingObjectSensor(Sensor):
-    """Place and velocity of the visible part of a rigid object, from a few points seen in two frames.
+    """Position and velocity of the visible part of a rigid object, from a few points tracked over two frames.
 
-    States are (position, velocity) in the world. Noise is that of the triangulation where the state is, so it grows
-    with the square of the depth; which part of the object is visible adds ``extent``. Position and velocity of one
-    measurement share the error of the current frame; the error of the frame before is shared with the measurement
-    before, for which the velocity's variance is doubled.
+    States are (position, velocity) in the world. Noise is that of the triangulation at the state, so it grows with the
+    square of the depth; the unknown visible part of the object adds ``extent``. Position and velocity of one
+    measurement share the error of the current frame; the error of the previous frame is shared with the previous
+    measurement, which is accounted for by doubling the variance of the velocity.
 
     Args:
         rig: the stereo rig.
@@ -42,9 +42,9 @@ class MovingObjectSensor(Sensor):
         pose_covariance: of the pose, right tangent.
         dt: time between both frames, s.
         sigma: standard deviation of a measured (u_left, u_right, v), px.
-        points: how many independent points are averaged.
+        points: number of independent points averaged.
         extent: standard deviation of the visible part's center in the object, m.
-        slack: standard deviation of what an object's velocity has beside the noise of its points, m/s.
+        slack: standard deviation of the velocity beyond the noise of the points, m/s.
 
     References:
         Thesis 4.3 and 5.4 [T-72], [T-78], [T-79]; rigid objects [T-12].
@@ -80,7 +80,7 @@ class MovingObjectSensor(Sensor):
         return MovingObject(state[:3], state[3:])
 
     def covariance(self, state: Float[Array, "6"], measurement: Any) -> Float[Array, "6 6"]:
-        """Of (position, velocity)."""
+        """Covariance of (position, velocity)."""
         del measurement
         place = self.pose.inverse().apply(state[None, :3])[0]
         place = place.at[2].set(jnp.maximum(place[2], _NEAREST))
@@ -88,19 +88,19 @@ class MovingObjectSensor(Sensor):
         jacobian = matmul(self.pose.rotation.matrix(), jax.jacfwd(lambda z: self.rig.triangulate(z[None])[0])(seen))
         noise = matmul(jacobian, jacobian.T) * (self.sigma**2 / self.points)
         eye = jnp.eye(3, dtype=noise.dtype)
-        turned = self._pose_jacobian(place)
-        carried = matmul(matmul(turned, self.pose_covariance), turned.T)
+        by_pose = self._pose_jacobian(place)
+        transported = matmul(matmul(by_pose, self.pose_covariance), by_pose.T)
         cross = noise / self.dt
-        position = noise + self.extent**2 * eye + carried
+        position = noise + self.extent**2 * eye + transported
         velocity = 4.0 * noise / self.dt**2 + self.slack**2 * eye
         return jnp.block([[position, cross], [cross, velocity]])
 
     def linearize(self, state: Float[Array, "6"], measurement: Any) -> tuple[MovingObject, Float[Array, "6 6"]]:
-        """The state, and the unit matrix."""
+        """The state and the identity matrix."""
         return self.expect(state, measurement), jnp.eye(6, dtype=state.dtype)
 
     def _pose_jacobian(self, place: Float[Array, "3"]) -> Float[Array, "3 6"]:
-        """Of a point of the camera's frame, in the world, by the right tangent of the pose: ``R [I, -[p]x]``."""
+        """Jacobian of a point in the world by the right tangent of the pose: ``R [I, -[p]x]``."""
         x, y, z = place
         zero = jnp.zeros_like(x)
         cross = jnp.stack([jnp.stack(row) for row in ((zero, z, -y), (-z, zero, x), (y, -x, zero))])

@@ -1,4 +1,4 @@
-"""Wheel odometry as motion models: turn-drive-turn with noise that grows with each, and slipping wheels."""
+"""Odometry motion models: rotation-translation-rotation with wheel slip, and differential drive."""
 
 import math
 from typing import Any
@@ -11,43 +11,43 @@ from jaxloc._linalg import matmul
 from jaxloc.beliefs.models import Motion, log_normal
 from jaxloc.poses import SE2, local
 
-_NO_WAY = 0.01  # below this distance the direction driven says nothing about a turn, m
+_LEAST_DISTANCE = 0.01  # below it, the direction of motion is undefined, m
 
 
 class OdometryMotion(Motion):
-    """Motion of a robot whose odometry counts turns of wheels: turn, drive, turn again, each with its own noise.
+    """Odometry motion model: a turn, a translation and a second turn, each with its own noise.
 
-    The control is the relative pose ``u = T_before_after`` that odometry reports, split into a turn r1, a distance s
-    and a turn r2. Their standard deviations are::
+    The control is the relative pose ``u = T_before_after`` of the odometry, split into a turn r1, a distance s and a
+    turn r2. Their standard deviations are::
 
         sigma_r1^2 = turn_turn^2 r1^2 + turn_drive^2 s^2 + turn_floor^2        (r2 alike)
         sigma_s^2  = drive_drive^2 s^2 + drive_turn^2 (r1^2 + r2^2) + drive_floor^2
 
-    Turns are measured towards the nearer end, so that driving backwards is no turn by pi. With probability `slip` the
-    distance is off by a normal of `slip_scale` times itself: wheels spin, someone pushes, an encoder counts backwards
-    as forwards. Without such tails one bad step loses the robot.
+    Turns are relative to the nearer end of the robot, so that driving backwards is not a turn by pi. With probability
+    `slip` the error of the distance has the standard deviation `slip_scale` times the distance: wheels slip, or the
+    robot is pushed. Without such tails a single outlier step loses the robot.
 
     Args:
-        turn_turn: rad of noise for a rad of turn (Thrun's alpha_1).
-        turn_drive: rad for a meter (alpha_2).
-        drive_drive: m for a meter (alpha_3).
-        drive_turn: m for a rad (alpha_4).
-        turn_floor: noise of each turn at rest, rad.
-        drive_floor: noise of the distance at rest, m.
-        slip: probability that the distance is not to be trusted.
-        slip_scale: its standard deviation then, as a part of the distance.
+        turn_turn: standard deviation of a turn, rad per rad (Thrun's alpha_1).
+        turn_drive: standard deviation of a turn, rad per m (alpha_2).
+        drive_drive: standard deviation of the distance, m per m (alpha_3).
+        drive_turn: standard deviation of the distance, m per rad (alpha_4).
+        turn_floor: standard deviation of a turn at rest, rad.
+        drive_floor: standard deviation of the distance at rest, m.
+        slip: probability of wheel slip.
+        slip_scale: standard deviation of the distance under slip, as a share of it.
 
     References:
-        Thrun, Burgard, Fox, *Probabilistic Robotics*, 2005, table 5.6 (there noise grows with its square root, as
-        here).
+        Thrun, Burgard, Fox, *Probabilistic Robotics*, 2005, table 5.6 (with standard
+        deviations, as here).
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxloc as jl
         >>> motion = jl.sensors.OdometryMotion(turn_turn=0.1, drive_drive=0.1)
-        >>> start, driven = jl.poses.SE2(0.0, 0.0, jnp.pi / 2), jl.poses.SE2(1.0, 0.0, 0.0)
-        >>> motion.move(start, driven).translation.round(3).tolist()
+        >>> pose, driven = jl.poses.SE2(0.0, 0.0, jnp.pi / 2), jl.poses.SE2(1.0, 0.0, 0.0)
+        >>> motion.move(pose, driven).translation.round(3).tolist()
         [-0.0, 1.0]
-        >>> motion.sample(start, driven, key=jax.random.key(0)).translation.shape
+        >>> motion.sample(pose, driven, key=jax.random.key(0)).translation.shape
         (2,)
     """
 
@@ -79,43 +79,45 @@ class OdometryMotion(Motion):
         self.turn_floor, self.drive_floor, self.slip, self.slip_scale = arrays[4:]
 
     def move(self, state: SE2, control: SE2) -> SE2:
-        """The pose moved by what odometry reports."""
+        """The pose moved by the odometry."""
         return state @ control
 
     def noise_dimension(self, state: SE2) -> int:
-        """Two turns, a distance, and one number that says whether the wheels slipped."""
+        """Two turns, a distance, and one number that decides on slip."""
         return 4
 
     def perturb(self, state: SE2, control: SE2, normal: Float[Array, "4"]) -> SE2:
-        """The pose that standard normal numbers lead to."""
+        """The next pose for standard normal numbers."""
         first, drive, second = split_motion(control)
         sigma_first, sigma_drive, sigma_second = self._sigmas(first, drive, second)
         slips = falls_below(normal[3], self.slip)
         sigma_drive = jnp.where(slips, self._slipping(drive, sigma_drive), sigma_drive)
         turned = first + sigma_first * normal[0]
         length = drive + sigma_drive * normal[1]
-        # The change goes on top of the reported motion, so that a step without noise is exact, also at rest.
+        # The error is added to the reported motion, so that a step without noise is exact, also at rest.
         x = control.translation[0] + length * jnp.cos(turned) - drive * jnp.cos(first)
         y = control.translation[1] + length * jnp.sin(turned) - drive * jnp.sin(first)
         turn = SE2(0.0 * x, 0.0 * x, sigma_first * normal[0] + sigma_second * normal[2])
         return state @ SE2.from_parts(control.rotation.compose(turn.rotation), jnp.stack([x, y]))
 
     def covariance(self, state: SE2, control: SE2) -> Float[Array, "3 3"]:
-        """First-order covariance of the noise in the tangent space of the moved pose, slips included."""
+        """First-order covariance of the noise in the tangent space of the moved pose, slip included."""
         first, drive, second = split_motion(control)
         sigmas = self._sigmas(first, drive, second)
-        calm, wild = (self._spread(control, sigmas, drive, slipping) for slipping in (False, True))
-        return (1.0 - self.slip) * calm + self.slip * wild
+        normal, slipped = (self._component(control, sigmas, drive, slipping) for slipping in (False, True))
+        return (1.0 - self.slip) * normal + self.slip * slipped
 
     def log_prob(self, state: SE2, control: SE2, moved: SE2) -> Float[Array, ""]:
-        """Log density of a next pose: a mixture of two normals, with and without slipping, to first order."""
+        """Log density of a next pose: a mixture of two normals, with and without slip, to first order."""
         first, drive, second = split_motion(control)
         sigmas = self._sigmas(first, drive, second)
         deviation, mask = local(self.move(state, control), moved), jnp.ones(3, bool)
-        calm, wild = (log_normal(deviation, self._spread(control, sigmas, drive, s), mask) for s in (False, True))
+        normal, slipped = (
+            log_normal(deviation, self._component(control, sigmas, drive, slipping), mask) for slipping in (False, True)
+        )
         tiny = float(jnp.finfo(self.slip.dtype).tiny)
         odds = jnp.log(jnp.maximum(jnp.stack([1.0 - self.slip, self.slip]), tiny))
-        return jnp.logaddexp(calm + odds[0], wild + odds[1])
+        return jnp.logaddexp(normal + odds[0], slipped + odds[1])
 
     def _sigmas(self, first: Array, drive: Array, second: Array) -> tuple[Array, Array, Array]:
         turn = (self.turn_drive * drive) ** 2 + self.turn_floor**2
@@ -126,12 +128,12 @@ class OdometryMotion(Motion):
     def _slipping(self, drive: Array, sigma: Array) -> Array:
         return jnp.sqrt(sigma**2 + (self.slip_scale * drive) ** 2)
 
-    def _spread(self, control: SE2, sigmas: tuple[Array, Array, Array], drive: Array, slipping: bool) -> Array:
+    def _component(self, control: SE2, sigmas: tuple[Array, Array, Array], drive: Array, slipping: bool) -> Array:
         """``J diag(sigma^2) J^T`` with J from (r1, s, r2) to the tangent of the moved pose."""
         heading, zero = control.rotation.inverse(), jnp.zeros_like(drive)
         x, y = control.translation[0], control.translation[1]
         first, _, _ = split_motion(control)
-        # In the frame before: a turn of r1 moves the end sideways, distance moves it along; then into the frame after.
+        # In the frame before, r1 moves the end sideways and s along the motion; then rotated into the frame after.
         columns = jnp.stack([jnp.stack([-y, x]), jnp.stack([jnp.cos(first), jnp.sin(first)])], axis=1)
         upper = jnp.concatenate([matmul(heading.matrix(), columns), zero[None, None] * columns[:, :1]], axis=1)
         jacobian = jnp.concatenate([upper, jnp.array([[1.0, 0.0, 1.0]], upper.dtype)])
@@ -141,15 +143,15 @@ class OdometryMotion(Motion):
 
 
 class DifferentialDrive(Motion):
-    """Motion of a robot with two driven wheels, by what each wheel has rolled.
+    """Differential drive: motion of a robot with two driven wheels on an arc.
 
-    The control is "2" the paths of the left and right wheel, m; the robot follows the arc between them. Each path errs
-    by ``sigma^2 = slip^2 |path| + floor^2``, as if every bit of the way erred by itself.
+    The control is "2", the distances of the left and right wheel, m. The variance of each is ``slip^2 |distance| +
+    floor^2``: errors along the path are independent.
 
     Args:
         track: distance between the wheels, m.
-        slip: m of noise at a meter of way.
-        floor: noise of each wheel at rest, m.
+        slip: standard deviation of a wheel's distance after 1 m, m.
+        floor: standard deviation of a wheel's distance at rest, m.
 
     References:
         Siegwart, Nourbakhsh, *Introduction to Autonomous Mobile Robots*, 2004, section 5.2.4.
@@ -174,15 +176,15 @@ class DifferentialDrive(Motion):
         return state @ self._arc(control)
 
     def noise_dimension(self, state: SE2) -> int:
-        """One number a wheel."""
+        """One number per wheel."""
         return 2
 
     def perturb(self, state: SE2, control: Float[Array, "2"], normal: Float[Array, "2"]) -> SE2:
-        """The pose that the wheels lead to when their paths err by standard normal numbers of sigmas."""
+        """The next pose for standard normal numbers, one for each wheel."""
         return state @ self._arc(control + self._sigmas(control) * normal)
 
     def covariance(self, state: SE2, control: Float[Array, "2"]) -> Float[Array, "3 3"]:
-        """First-order covariance in the tangent space of the moved pose; a plane of it is empty but for rounding."""
+        """First-order covariance in the tangent space of the moved pose, of rank two but for rounding."""
         angle = (control[1] - control[0]) / self.track
         half = SE2.left_jacobian(-jnp.stack([jnp.mean(control), 0.0 * angle, angle]))
         wheels = jnp.array([[0.5, 0.5], [0.0, 0.0]], control.dtype)
@@ -199,13 +201,13 @@ class DifferentialDrive(Motion):
 
 
 def split_motion(motion: SE2) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """A relative pose as turn, distance and turn; the distance is negative where it drove backwards.
+    """A relative pose as turn, distance and turn; the distance is negative for backward motion.
 
     Args:
         motion: ``T_before_after``.
 
     Returns:
-        First turn (rad), distance (m, negative backwards), second turn (rad). A way below 1 cm has no first turn.
+        First turn (rad), distance (m, negative backwards), second turn (rad). The first turn is zero below 1 cm.
 
     Example:
         >>> import jaxloc as jl
@@ -214,7 +216,7 @@ def split_motion(motion: SE2) -> tuple[Float[Array, ""], Float[Array, ""], Float
     """
     x, y = motion.translation[0], motion.translation[1]
     squared = x * x + y * y
-    moved = squared > _NO_WAY**2
+    moved = squared > _LEAST_DISTANCE**2
     length = jnp.sqrt(jnp.where(moved, squared, 1.0))
     forward = jnp.where(x < 0, -1.0, 1.0).astype(x.dtype)
     first = jnp.where(moved, jnp.arctan2(forward * jnp.where(moved, y, 0.0), jnp.where(moved, forward * x, 1.0)), 0.0)

@@ -1,4 +1,4 @@
-"""Ranges to radio beacons, whose bias and unit of length a robot has to find out on its way."""
+"""Range measurements to radio beacons, with an estimated bias and scale error."""
 
 from typing import Any
 
@@ -14,11 +14,11 @@ from jaxloc.sensors.landmarks import length, pose_of, row
 
 
 class Range(eqx.Module):
-    """How far one landmark was: the reading of a radio beacon.
+    """A range measurement to a known beacon.
 
     Attributes:
         range: m.
-        landmark: which one it was: a row of the map.
+        landmark: index of the beacon: a row of the map.
     """
 
     range: Float[Array, ""]
@@ -26,12 +26,12 @@ class Range(eqx.Module):
 
 
 class RangingState(eqx.Module):
-    """A robot whose radio measures ``(1 + scale) distance + bias``: both are to be found on the way.
+    """State of a robot whose ranging measures ``(1 + scale) distance + bias``, with bias and scale estimated.
 
     Attributes:
         pose: T_world_robot.
-        bias: m.
-        scale: relative error of the unit of length.
+        bias: of ranges, m.
+        scale: relative scale error of ranges.
     """
 
     pose: SE2
@@ -66,7 +66,7 @@ class RangeSensor(Sensor):
         self.deviation = as_floats(deviation)[0].astype(landmarks.dtype)
 
     def expect(self, state: Any, measurement: Range) -> Range:
-        """The range that would be read from there."""
+        """The range from a pose."""
         offset = row(self.landmarks, measurement.landmark) - pose_of(state).translation
         distance = length(offset)
         if isinstance(state, RangingState):
@@ -74,17 +74,17 @@ class RangeSensor(Sensor):
         return Range(distance, measurement.landmark)
 
     def covariance(self, state: Any, measurement: Range) -> Float[Array, "1 1"]:
-        """Of the range."""
+        """Variance of the range."""
         del state, measurement
         return (self.deviation**2)[None, None]
 
 
 class RangingMotion(Motion):
-    """Motion of a `RangingState`: the pose follows odometry, bias and scale wander slowly.
+    """Motion of a `RangingState`: the pose follows odometry, bias and scale are random walks.
 
     Attributes:
         motion: of the pose.
-        walks: how far bias (m) and scale wander in a second, standard deviations.
+        walks: standard deviations of the random walks of bias (m) and scale after 1 s.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -107,6 +107,6 @@ class RangingMotion(Motion):
         return RangingState(self.motion.move(state.pose, control), state.bias, state.scale)
 
     def covariance(self, state: RangingState, control: Increment) -> Float[Array, "5 5"]:
-        """Of (pose, bias, scale)."""
+        """Covariance of (pose, bias, scale)."""
         covariance = jnp.zeros((5, 5), self.walks.dtype).at[:3, :3].set(self.motion.covariance(state.pose, control))
         return covariance.at[3:, 3:].set(jnp.diag(self.walks**2 * control.dt))

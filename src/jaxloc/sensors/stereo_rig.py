@@ -1,4 +1,4 @@
-"""Stereo rigs: two equal cameras whose rows are aligned."""
+"""Rectified stereo rig: projection and triangulation."""
 
 from typing import Any
 
@@ -8,11 +8,11 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc.sensors.camera import Pinhole
 
-_SMALLEST = 1e-6  # disparities at or below this show no depth, px
+_SMALLEST = 1e-6  # least disparity with a depth, px
 
 
 class StereoRig(eqx.Module):
-    """A rectified pair: the right camera equals the left and stands ``baseline`` to its right (+x).
+    """A rectified stereo pair: two equal cameras, the right one displaced by ``baseline`` along +x.
 
     A measurement is ``(u_left, u_right, v)`` with ``u_right = u_left - fx B / z``.
 
@@ -58,7 +58,7 @@ class StereoRig(eqx.Module):
         return jnp.stack([u_left, u_left - jnp.where(front, disparity, 0.0), v])
 
     def in_front(self, points: Float[Array, "n 3"]) -> Bool[Array, " n"]:
-        """Whether points have an image."""
+        """Whether points are projected (see `Pinhole.in_front`)."""
         return self.camera.in_front(points)
 
     def in_front_components(
@@ -78,8 +78,7 @@ class StereoRig(eqx.Module):
             measurements: "n 3" (u_left, u_right, v), px.
 
         Returns:
-            Points "n 3", m. Without disparity (see `has_depth`) the point is put where d = 1 px, finite and with zero
-            gradient.
+            Points "n 3", m. Without disparity (see `has_depth`) the point is that of d = 1 px, with zero gradient.
         """
         seen = self.has_depth(measurements)
         u_left, u_right, v = (jnp.where(seen, measurements[:, i], 0.0) for i in range(3))

@@ -1,8 +1,8 @@
-"""One-to-one assignment of rows to columns at the least total cost: exact, of static shape, and quick in a batch.
+"""Linear assignment: one-to-one assignment of rows to columns of least total cost, exact and of static shape.
 
-Prices on the columns make every row content with what it has. Rounds of bidding (all rows at once) serve most rows;
-each that is left finds a shortest augmenting path. All paths run in one flat loop, so that the members of a batch do
-not wait for one another at each row.
+Dual prices on the columns certify optimality. Rounds of the auction algorithm (all rows at once) assign most rows; each
+of the rest by a shortest augmenting path. All paths run in one flat loop, so that the members of a batch do not wait
+for one another at each row.
 
 References:
     Jonker and Volgenant, "A shortest augmenting path algorithm for dense and sparse linear assignment problems", 1987.
@@ -17,15 +17,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _tree as tree
 
-_ROUNDS = 3  # of bidding: beyond these, paths are quicker
+_ROUNDS = 3  # of the auction: beyond these, augmenting paths are faster
 
 
 class Assignment(eqx.Module):
-    """Which column each row has.
+    """An assignment of rows to columns.
 
     Attributes:
-        columns: one for each row; -1 where it has none.
-        cost: sum over the pairs, and over what rows pay that have none.
+        columns: column of each row; -1 for unassigned rows.
+        cost: sum over the pairs, plus the cost of unassigned rows.
     """
 
     columns: Int[Array, " n"]
@@ -33,9 +33,9 @@ class Assignment(eqx.Module):
 
 
 class _Search(eqx.Module):
-    """The loop's state: the matching, and the tree of shortest paths from the row that looks for a column.
+    """State of the loop: the matching, and the tree of shortest paths from the current row.
 
-    Rows that wait are `pending`. `handed` is the column to hand back along the path, -1 while the tree grows.
+    Rows still to assign are `pending`. `handed` is the column to pass back along the path, -1 while the tree grows.
     """
 
     column_of: Int[Array, " n"]
@@ -52,22 +52,22 @@ class _Search(eqx.Module):
     handed: Int[Array, ""]
 
 
-@jax.jit  # called often, and quickly done: Equinox's jit would take as long as the work
+@jax.jit  # called often and short: the overhead of Equinox's jit would be as long as the work
 def assign(
     costs: Float[Array, "n m"], valid: Bool[Array, "n m"], *, unassigned: Float[Array, " n"] | None = None
 ) -> Assignment:
-    """The best one-to-one assignment: as many rows as possible, then the least total cost.
+    """The best one-to-one assignment: of as many rows as possible, then of least total cost.
 
     The gradient of the cost is that of the pairs chosen.
 
     Args:
         costs: of each pair; pairs of cost NaN or infinity are forbidden.
-        valid: pairs that are allowed.
-        unassigned: what a row pays that stays without a column (infinite: it must have one if it can). With it, the
-            total is least, not the number of rows without a column. Set it to zero for rows that are padding.
+        valid: mask of the allowed pairs.
+        unassigned: cost of leaving a row unassigned (infinite: assign it if possible). With it, the total cost is
+            minimized instead of the number of unassigned rows. Set it to zero for padding rows.
 
     Returns:
-        The assignment. In float32 it is best up to rounding of the largest cost times the number of rows.
+        The assignment. In float32 it is optimal up to rounding of the largest cost times the number of rows.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -83,37 +83,37 @@ def assign(
     columns = _columns(fixed, allowed, None if unassigned is None else lax.stop_gradient(unassigned))
     taken = columns >= 0
     picked = jnp.take_along_axis(safe, jnp.where(taken, columns, 0)[:, None], axis=1)[:, 0]
-    alone = jnp.zeros_like(picked) if unassigned is None else jnp.where(jnp.isfinite(unassigned), unassigned, 0.0)
-    return Assignment(columns, jnp.sum(jnp.where(taken, picked, alone)))
+    left = jnp.zeros_like(picked) if unassigned is None else jnp.where(jnp.isfinite(unassigned), unassigned, 0.0)
+    return Assignment(columns, jnp.sum(jnp.where(taken, picked, left)))
 
 
 def _columns(costs: Array, allowed: Array, unassigned: Array | None) -> Int[Array, " n"]:
-    """Columns of an assignment, worked out with the shorter side as rows: they rarely stay alone."""
+    """Columns of an assignment, solved with the shorter side as rows, which rarely stay unassigned."""
     n, m = costs.shape
     if n == 0 or m == 0:
         return jnp.full((n,), -1, jnp.int32)
     low = jnp.min(costs, initial=jnp.inf, where=allowed)
     low = jnp.where(jnp.isfinite(low), low, 0.0)
     costs = jnp.where(allowed, costs - low, 0.0)
-    # More than any exchange of columns can save: no row stays alone to make others cheaper.
+    # More than any exchange of columns can save: no row stays unassigned to reduce the cost of others.
     reach = jnp.max(costs)
-    dear = (min(n, m) + 1.0) * jnp.where(reach > 0, reach, 1.0)
+    penalty = (min(n, m) + 1.0) * jnp.where(reach > 0, reach, 1.0)
     if unassigned is None:
-        stay = jnp.full((n,), dear, costs.dtype)
+        stay = jnp.full((n,), penalty, costs.dtype)
     else:
         bounded = jnp.isfinite(unassigned)
-        stay = jnp.where(bounded, jnp.where(bounded, unassigned, 0.0) - low, dear)
+        stay = jnp.where(bounded, jnp.where(bounded, unassigned, 0.0) - low, penalty)
     if n <= m:
         return _solve(jnp.where(allowed, costs, jnp.inf), stay).column_of
     if unassigned is not None:
         flipped, stay = costs - stay[:, None], jnp.zeros((m,), costs.dtype)
     else:
-        flipped, stay = costs, jnp.full((m,), dear, costs.dtype)
+        flipped, stay = costs, jnp.full((m,), penalty, costs.dtype)
     return _solve(jnp.where(allowed, flipped, jnp.inf).T, stay).row_of
 
 
 def _solve(costs: Float[Array, "n m"], stay: Float[Array, " n"]) -> _Search:
-    """Least total cost, where a row may stay alone at a finite cost; forbidden pairs cost infinity."""
+    """Least total cost, where a row may stay unassigned at a finite cost; forbidden pairs cost infinity."""
     n, m = costs.shape
     none, zero = jnp.array(-1, jnp.int32), jnp.zeros((), costs.dtype)
     empty = _Search(
@@ -130,12 +130,12 @@ def _solve(costs: Float[Array, "n m"], stay: Float[Array, " n"]) -> _Search:
         leaving_length=jnp.array(jnp.inf, costs.dtype),
         handed=none,
     )
-    start = _next_row(lax.fori_loop(0, _ROUNDS, lambda _, s: _bid(costs, stay, s), empty))
-    return lax.while_loop(lambda s: s.row >= 0, lambda s: _step(costs, stay, s), start)
+    first = _next_row(lax.fori_loop(0, _ROUNDS, lambda _, s: _bid(costs, stay, s), empty))
+    return lax.while_loop(lambda s: s.row >= 0, lambda s: _step(costs, stay, s), first)
 
 
 def _bid(costs: Array, stay: Array, search: _Search) -> _Search:
-    """Every row that waits bids for its best column as much as it would lose with its second best one."""
+    """Every pending row bids for its best column the difference to its second best."""
     n, m = costs.shape
     rows, columns = _range(n), _range(m)
     net = costs - search.prices[None]
@@ -166,12 +166,12 @@ def _bid(costs: Array, stay: Array, search: _Search) -> _Search:
 
 
 def _step(costs: Array, stay: Array, search: _Search) -> _Search:
-    """Grows the tree by a column, or hands a column one step back along the path."""
+    """Grows the tree by a column, or passes a column one step back along the path."""
     return lax.cond(search.handed < 0, lambda s: _grow(costs, stay, s), _hand_back, search)
 
 
 def _grow(costs: Array, stay: Array, search: _Search) -> _Search:
-    """Visits the row that was reached last, and goes on to the nearest column; ends at one that is free."""
+    """Visits the row that was reached last and the nearest column; ends at a free column."""
     row = search.row
     lengths = costs[row] - search.prices + search.base
     better = (lengths < search.lengths) & ~search.visited
@@ -192,7 +192,7 @@ def _grow(costs: Array, stay: Array, search: _Search) -> _Search:
     base = nearest - (costs[following, column] - search.prices[column])
 
     prices = jnp.where(search.visited & done, search.prices - (length - search.lengths), search.prices)
-    # A row that leaves hands its own column back.
+    # A row that becomes unassigned passes its own column back.
     handed = jnp.where(done, jnp.where(drop, search.column_of[leaving], column), -1)
     grown = _Search(
         column_of=jnp.where(done & drop & (_range(costs.shape[0]) == leaving), -1, search.column_of),
@@ -213,7 +213,7 @@ def _grow(costs: Array, stay: Array, search: _Search) -> _Search:
 
 
 def _hand_back(search: _Search) -> _Search:
-    """The parent of the column takes it and frees its own, up to the row that had none."""
+    """The parent row of the column takes it and releases its own, up to the row that had none."""
     column = search.handed
     row = search.parents[column]
     before = search.column_of[row]
@@ -230,7 +230,7 @@ def _hand_back(search: _Search) -> _Search:
 
 
 def _next_row(search: _Search) -> _Search:
-    """Starts the tree of the next row that waits; row -1 when none does."""
+    """Starts the tree of the next pending row; row -1 when there is none."""
     row = jnp.where(jnp.any(search.pending), jnp.argmax(search.pending), -1).astype(jnp.int32)
     none = jnp.array(-1, jnp.int32)
     return eqx.tree_at(

@@ -1,8 +1,7 @@
-"""Small symmetric systems: an unrolled Cholesky factorization that never fails, and its use as a lineax solver.
+"""Cholesky factorization of positive semidefinite matrices with rank detection, also as a lineax solver.
 
-A pivot that is lost in rounding marks a direction that the data do not determine. It is replaced by a large number in
-solves, so that the step does not move along that direction, and by the smallest meaningful one in inverses, so that the
-covariance there is huge but finite.
+A pivot at rounding level marks a direction that the data do not determine. Solves drop the component along it, so that
+steps do not move there; inverses use the tolerance in its place, so that the variance there is huge but finite.
 """
 
 from typing import Any
@@ -21,11 +20,11 @@ def rank_tolerance(dtype: Any) -> float:
 
 
 class Factor(eqx.Module):
-    """Lower triangular factor of a scaled matrix, ``D H D = L L^T``, with guarded pivots.
+    """Lower triangular factor of a scaled matrix, ``D H D = L L^T``, with the pivots that are at rounding level marked.
 
     Attributes:
         lower: rows of L, zero above the diagonal.
-        lost: directions whose pivot was lost.
+        lost: directions whose pivot is at rounding level.
         scale: the diagonal of D, which makes the diagonal of the scaled matrix one.
     """
 
@@ -58,10 +57,7 @@ class Factor(eqx.Module):
 
 
 def factor(matrix: Float[Array, "d d"]) -> Factor:
-    """Guarded Cholesky factorization of a positive semidefinite matrix, scaled to a unit diagonal.
-
-    Unrolled to scalar operations up to nine unknowns: a batch of small matrices is then one fused loop instead of a
-    library call each.
+    """Cholesky factorization of a positive semidefinite matrix, scaled to a unit diagonal, with rank detection.
 
     Args:
         matrix: symmetric, its lower triangle is read.
@@ -75,7 +71,7 @@ def factor(matrix: Float[Array, "d d"]) -> Factor:
         >>> factor.solve(jnp.array([8.0, 7.0])).round(4).tolist()
         [1.25, 1.5]
     """
-    # A nan left in the matrix would pass to the derivatives of every entry scaled with it.
+    # NaN left in the matrix would pass to the derivatives of every entry scaled with it.
     matrix = jnp.where(jnp.isfinite(matrix), matrix, 0.0)
     diagonal = jnp.diagonal(matrix)
     positive = diagonal > jnp.finfo(matrix.dtype).tiny
@@ -113,10 +109,11 @@ def _unrolled_gram(rows: list[list[Array]]) -> Float[Array, "d d"]:
 
 
 class Cholesky(lx.AbstractLinearSolver):
-    """The guarded factorization as a lineax solver for (damped) normal equations.
+    """The factorization as a lineax solver for (damped) normal equations.
 
-    It squares the condition number that QR would see and is several times faster in batches. Use ``lineax.QR()`` where
-    the Jacobian's condition exceeds the square root of the precision: about 1e3 in float32, 1e7 in float64.
+    It squares the condition number of the Jacobian that QR works on, and is several times faster in batches. Use
+    ``lineax.QR()`` where the Jacobian's condition exceeds the square root of the precision: about 1e3 in float32, 1e7
+    in float64.
     """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Factor:
@@ -125,7 +122,7 @@ class Cholesky(lx.AbstractLinearSolver):
         return factor(operator.as_matrix())
 
     def compute(self, state: Factor, vector: Any, options: dict[str, Any]) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
-        """Solves; an undetermined system is no error, its step has no component along what is undetermined."""
+        """Solves; an undetermined system is no error, its solution has no component along undetermined directions."""
         del options
         return state.solve(vector), lx.RESULTS.successful, {}
 

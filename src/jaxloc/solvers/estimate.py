@@ -1,4 +1,4 @@
-"""What every one-shot method returns: a value, how sure it is, and whether to believe it."""
+"""Estimate: the result of one-shot estimators, a value with covariance, status and observability."""
 
 from enum import IntEnum
 from typing import Any
@@ -13,7 +13,7 @@ from jaxloc.solvers.cholesky import rank_tolerance
 
 
 class Status(IntEnum):
-    """How a solve ended."""
+    """Status of an estimate."""
 
     CONVERGED = 0
     MAX_STEPS = 1
@@ -27,17 +27,17 @@ _MEANING = {
     Status.CONVERGED: "converged",
     Status.MAX_STEPS: "not converged within max_steps: raise max_steps, start closer, or use LevenbergMarquardt()",
     Status.RANK_DEFICIENT: "the data do not determine every direction of the state",
-    Status.DIVERGED: "the cost ended above that of the start: start closer, or use LevenbergMarquardt()",
-    Status.NONFINITE: "the data or the start hold nan or inf",
-    Status.INADMISSIBLE: "the answer contradicts the model, as a point behind the camera that sees it does",
+    Status.DIVERGED: "the cost ended above the initial one: start closer, or use LevenbergMarquardt()",
+    Status.NONFINITE: "the data or the initial value hold nan or inf",
+    Status.INADMISSIBLE: "the result contradicts the model, such as an observed point behind its camera",
 }
 
 
 class Observability(eqx.Module):
-    """Which directions of the state the data determine.
+    """Spectrum of the information matrix: which directions of the state the data determine.
 
     Attributes:
-        eigenvalues: of the information matrix scaled to a unit diagonal, ascending; zero where nothing is known.
+        eigenvalues: of the information matrix scaled to a unit diagonal, ascending; zero along undetermined directions.
         directions: unit eigenvectors as columns, in the tangent space of the value.
         rank: number of directions that the data determine.
         condition: ratio of the largest to the smallest eigenvalue, inf when rank deficient.
@@ -50,14 +50,14 @@ class Observability(eqx.Module):
 
 
 class Estimate(eqx.Module):
-    """The answer of an estimator.
+    """Result of an estimator.
 
     Attributes:
         value: the estimate: a pose, or any pytree with poses and arrays.
         covariance: in the tangent space of the value (right perturbation, translation before rotation).
         cost: the objective at the value, the sum of rho over whitened residuals.
         ok: whether value and covariance can be used. Gradients are zero where it is False.
-        num_steps: solver steps taken (0 for closed forms).
+        num_steps: number of solver steps (0 for closed forms).
         status: a `Status` code.
         information: the Gauss-Newton Hessian at the value.
     """
@@ -71,7 +71,7 @@ class Estimate(eqx.Module):
     information: Float[Array, "d d"]
 
     def gaussian(self) -> Gaussian:
-        """The estimate as a density: what filters, trackers and pose graphs accept."""
+        """The estimate as a density, as filters, trackers and pose graphs take it."""
         return Gaussian(self.value, self.covariance)
 
     @eqx.filter_jit
@@ -90,29 +90,30 @@ class Estimate(eqx.Module):
         return Observability(eigenvalues, directions, jnp.sum(determined), condition)
 
     def describe(self) -> str:
-        """One line for people: how it ended and, if so, which directions are unobservable (host only, one estimate)."""
+        """One line of text: the status and any unobservable directions (host only, one estimate)."""
         status = Status(int(self.status))
         text = f"{_MEANING[status]} ({int(self.num_steps)} steps, cost {float(self.cost):.6g})"
         if status is Status.RANK_DEFICIENT:
-            seen = self.observability()
+            spectrum = self.observability()
             names = tangent_labels(self.value)
-            missing = [_spell(seen.directions[:, i], names) for i in range(len(names) - int(seen.rank))]
+            count = len(names) - int(spectrum.rank)
+            missing = [_describe_direction(spectrum.directions[:, i], names) for i in range(count)]
             text += f"; unobservable: {'; '.join(missing)}"
         return text
 
     def check(self) -> "Estimate":
-        """Itself, when it is ok (host only).
+        """The estimate itself, if ok (host only).
 
         Raises:
-            ValueError: it is not; the message says why.
+            ValueError: if not; the message gives the status.
         """
         if not bool(jnp.all(self.ok)):
             raise ValueError(f"The estimate is not usable: {self.describe()}.")
         return self
 
 
-def _spell(direction: Float[Array, " d"], names: tuple[str, ...]) -> str:
-    """A direction in words: its largest components by name."""
+def _describe_direction(direction: Float[Array, " d"], names: tuple[str, ...]) -> str:
+    """A direction as text: its largest components by name."""
     largest = float(jnp.max(jnp.abs(direction)))
     terms = [(float(c), name) for c, name in zip(direction, names, strict=True) if abs(float(c)) > 0.1 * largest]
     terms.sort(key=lambda term: -abs(term[0]))

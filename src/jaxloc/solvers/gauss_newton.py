@@ -1,10 +1,10 @@
-"""Least-squares solvers on the tangent space, as optimistix solvers.
+"""Gauss-Newton, Levenberg-Marquardt and dogleg on manifolds, as optimistix solvers.
 
 Optimistix adds Euclidean steps, so a pose given to its own solvers is silently fitted as a similarity. The solver here
-keeps the pose as the state, moves it by retraction in every step, and hands tangent vectors to optimistix's descents
-and searches, which stay as they are.
+keeps the pose as the state, moves it by retraction in every step, and passes tangent vectors to optimistix's own
+descents and searches.
 
-Normal equations are scaled to a unit diagonal, so that damping and trust regions know no units.
+Normal equations are scaled to a unit diagonal, so that damping and trust regions do not depend on units.
 """
 
 from abc import abstractmethod
@@ -26,27 +26,7 @@ from jaxloc.solvers.problem import Problem, items, normal_equations, with_losses
 
 
 class Solver(eqx.Module):
-    """How to minimize: a strategy record."""
-
-    rtol: eqx.AbstractVar[float | None]
-    linear_solver: eqx.AbstractVar[lx.AbstractLinearSolver]
-
-    @abstractmethod
-    def descent(self) -> optx.AbstractDescent:
-        """Which way to step."""
-
-    @abstractmethod
-    def search(self) -> optx.AbstractSearch:
-        """How far to step."""
-
-    @property
-    @abstractmethod
-    def damping(self) -> float:
-        """Damping of the first step, relative to the unit diagonal; 1 where the descent has none."""
-
-
-class GaussNewton(Solver):
-    """Full steps to the bottom of the quadratic picture [K-71, K-73].
+    """A minimization strategy.
 
     Attributes:
         rtol: relative tolerance; None takes one that suits the dtype.
@@ -55,32 +35,40 @@ class GaussNewton(Solver):
 
     rtol: float | None = eqx.field(default=None, static=True)
     linear_solver: lx.AbstractLinearSolver = Cholesky()
+
+    @abstractmethod
+    def descent(self) -> optx.AbstractDescent:
+        """Direction of the steps."""
+
+    @abstractmethod
+    def search(self) -> optx.AbstractSearch:
+        """Length of the steps."""
+
+    @property
+    def damping(self) -> float:
+        """Damping of the first step, relative to the unit diagonal; 1 where the descent has none."""
+        return 1.0
+
+
+class GaussNewton(Solver):
+    """Gauss-Newton: full steps to the minimum of the quadratic model [K-71, K-73]."""
 
     def descent(self) -> optx.AbstractDescent:
         """Newton's."""
         return optx.NewtonDescent(linear_solver=self.linear_solver)
 
     def search(self) -> optx.AbstractSearch:
-        """None: the full step."""
+        """The full step."""
         return optx.LearningRate(1.0)
-
-    @property
-    def damping(self) -> float:
-        """None."""
-        return 1.0
 
 
 class LevenbergMarquardt(Solver):
-    """Damped steps, never uphill: for starts far from the answer.
+    """Levenberg-Marquardt: damped steps that never increase the cost, for initial values far from the minimum.
 
     Attributes:
-        rtol: relative tolerance; None takes one that suits the dtype.
-        linear_solver: `Cholesky` on the normal equations, or ``lineax.QR()`` on the Jacobian.
         initial_damping: relative to the diagonal of the normal equations (Marquardt's scaling).
     """
 
-    rtol: float | None = eqx.field(default=None, static=True)
-    linear_solver: lx.AbstractLinearSolver = Cholesky()
     initial_damping: float = eqx.field(default=1e-3, static=True)
 
     def descent(self) -> optx.AbstractDescent:
@@ -98,15 +86,7 @@ class LevenbergMarquardt(Solver):
 
 
 class Dogleg(Solver):
-    """Powell's path from steepest descent to Gauss-Newton inside a trust region.
-
-    Attributes:
-        rtol: relative tolerance; None takes one that suits the dtype.
-        linear_solver: `Cholesky` on the normal equations, or ``lineax.QR()`` on the Jacobian.
-    """
-
-    rtol: float | None = eqx.field(default=None, static=True)
-    linear_solver: lx.AbstractLinearSolver = Cholesky()
+    """Powell's dogleg between steepest descent and Gauss-Newton inside a trust region."""
 
     def descent(self) -> optx.AbstractDescent:
         """Dogleg."""
@@ -116,14 +96,9 @@ class Dogleg(Solver):
         """Trust region."""
         return optx.ClassicalTrustRegion(high_cutoff=0.75)
 
-    @property
-    def damping(self) -> float:
-        """None."""
-        return 1.0
 
-
-class _Picture(NamedTuple):
-    """Normal equations in tangent coordinates of unit curvature: ``delta = scale * x``."""
+class _QuadraticModel(NamedTuple):
+    """Quadratic model of the objective in tangent coordinates of unit curvature, ``delta = scale * x``."""
 
     cost: Float[Array, ""]
     gradient: Float[Array, " d"]
@@ -137,7 +112,7 @@ class _State(NamedTuple):
     first: Bool[Array, ""]
     near: Bool[Array, ""]
     step: Float[Array, " d"]
-    picture: _Picture
+    model: _QuadraticModel
     descent: Any
     search: Any
     terminate: Bool[Array, ""]
@@ -146,7 +121,7 @@ class _State(NamedTuple):
 
 
 class TangentSolver(optx.AbstractLeastSquaresSolver):
-    """The optimistix solver behind every strategy: its ``args`` are the problem and the state's unmoving leaves."""
+    """The optimistix solver of all strategies; its ``args`` are the problem and the state's leaves that do not move."""
 
     strategy: Solver
     rtol: float = eqx.field(static=True)
@@ -165,67 +140,67 @@ class TangentSolver(optx.AbstractLeastSquaresSolver):
     def _by_jacobian(self) -> bool:
         return not isinstance(self.strategy.linear_solver, Cholesky)
 
-    def _picture(self, problem: Problem, y: Any, near: Bool[Array, ""]) -> _Picture:
+    def _model(self, problem: Problem, y: Any, near: Bool[Array, ""]) -> _QuadraticModel:
         normal = normal_equations(problem, y)
         hessian = normal.hessian
-        if normal.bend is not None:
-            hessian = hessian + jnp.where(near, normal.bend, 0.0)
+        if normal.correction is not None:
+            hessian = hessian + jnp.where(near, normal.correction, 0.0)
         diagonal = jnp.diagonal(hessian)
         positive = (diagonal > jnp.finfo(diagonal.dtype).tiny) & jnp.isfinite(diagonal)
         scale = jnp.where(positive, 1.0 / jnp.sqrt(jnp.where(positive, diagonal, 1.0)), 1.0)
         hessian = hessian * scale[:, None] * scale[None, :]
         residual, jacobian = _weighted_rows(problem, y, scale) if self._by_jacobian else (None, None)
-        return _Picture(normal.cost, normal.gradient * scale, hessian, scale, residual, jacobian)
+        return _QuadraticModel(normal.cost, normal.gradient * scale, hessian, scale, residual, jacobian)
 
-    def _normal_info(self, picture: _Picture) -> optx.FunctionInfo.EvalGradHessian:
-        """What optimistix sees; over the initial damping, so that its unit damping is that part of the diagonal."""
+    def _normal_info(self, model: _QuadraticModel) -> optx.FunctionInfo.EvalGradHessian:
+        """The model for optimistix, over the initial damping, so that its unit damping is that part of the diagonal."""
         inverse = 1.0 / self.strategy.damping
-        hessian = lx.MatrixLinearOperator(picture.hessian * inverse, lx.positive_semidefinite_tag)
-        return optx.FunctionInfo.EvalGradHessian(picture.cost * inverse, picture.gradient * inverse, hessian)
+        hessian = lx.MatrixLinearOperator(model.hessian * inverse, lx.positive_semidefinite_tag)
+        return optx.FunctionInfo.EvalGradHessian(model.cost * inverse, model.gradient * inverse, hessian)
 
-    def _descent_info(self, picture: _Picture) -> Any:
+    def _descent_info(self, model: _QuadraticModel) -> Any:
         if not self._by_jacobian:
-            return self._normal_info(picture)
+            return self._normal_info(model)
         inverse = self.strategy.damping**-0.5
         return optx.FunctionInfo.ResidualJac(
-            picture.residual * inverse, lx.MatrixLinearOperator(picture.jacobian * inverse)
+            model.residual * inverse, lx.MatrixLinearOperator(model.jacobian * inverse)
         )
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
         """The state before the first evaluation."""
         problem, rest = args
-        structure = jax.eval_shape(lambda: self._picture(problem, eqx.combine(y, rest), jnp.array(False)))
-        picture = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), structure)
-        step = jnp.zeros_like(picture.gradient)
-        descent = self.strategy.descent().init(step, self._descent_info(picture))
+        structure = jax.eval_shape(lambda: self._model(problem, eqx.combine(y, rest), jnp.array(False)))
+        model = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), structure)
+        step = jnp.zeros_like(model.gradient)
+        descent = self.strategy.descent().init(step, self._descent_info(model))
         descent = eqx.filter(descent, eqx.is_array, inverse=False)
-        search = self.strategy.search().init(step, self._normal_info(picture))
+        search = self.strategy.search().init(step, self._normal_info(model))
         search = jax.tree.map(lambda leaf: leaf.astype(step.dtype), search)
         descent = jax.tree.map(lambda leaf: _as(leaf, step.dtype), descent)
         converged = jnp.asarray(int(Status.CONVERGED))
         return _State(
-            jnp.array(True), jnp.array(False), step, picture, descent, search, jnp.array(False), converged, picture.cost
+            jnp.array(True), jnp.array(False), step, model, descent, search, jnp.array(False), converged, model.cost
         )
 
     def step(self, fn, y, args, options, state: _State, tags):
-        """Evaluates where the last step led, accepts or rejects it, and chooses the next one."""
+        """Evaluates the result of the last step, accepts or rejects it, and computes the next one."""
         problem, rest = args
-        moved = retract(y, state.picture.scale * state.step)
-        found = self._picture(problem, eqx.combine(moved, rest), state.near)
+        moved = retract(y, state.model.scale * state.step)
+        found = self._model(problem, eqx.combine(moved, rest), state.near)
         zero = jnp.zeros_like(state.step)
         size, accept, _, search = self.strategy.search().step(
-            state.first, zero, state.step, self._normal_info(state.picture), self._normal_info(found), state.search
+            state.first, zero, state.step, self._normal_info(state.model), self._normal_info(found), state.search
         )
         size = size.astype(zero.dtype)
         finite = jnp.isfinite(found.cost) & jnp.all(jnp.isfinite(found.gradient))
         accept = accept & finite
-        y, picture = _where(accept, (moved, found), (y, state.picture))
+        y, model = tree.where(accept, (moved, found), (y, state.model))
         descent = self.strategy.descent()
-        # The queries of optimistix's descents depend on the accepted picture alone, so asking again costs nothing new.
-        descent_state = descent.query(zero, self._descent_info(picture), state.descent)
+        # The queries of optimistix's descents depend on the accepted model alone, so repeating them changes nothing.
+        descent_state = descent.query(zero, self._descent_info(model), state.descent)
         step, _ = descent.step(size, descent_state)
         step = jnp.where(jnp.isfinite(step), step, 0.0)
-        small = self._small(y, picture, step)
+        small = self._small(y, model, step)
         lost = ~finite & (state.first | isinstance(self.strategy, GaussNewton))
         status = jnp.where(lost, int(Status.NONFINITE), int(Status.CONVERGED))
         search = jax.tree.map(lambda leaf: leaf.astype(zero.dtype), search)
@@ -233,10 +208,10 @@ class TangentSolver(optx.AbstractLeastSquaresSolver):
         first_cost = jnp.where(state.first, found.cost, state.first_cost)
         state = _State(
             first=jnp.array(False),
-            # Within a sigma of the minimum the kernels' curvature can be trusted.
-            near=-jnp.sum(picture.gradient * step) < 1.0,
+            # Within a standard deviation of the minimum the exact curvature of the kernels is used.
+            near=-jnp.sum(model.gradient * step) < 1.0,
             step=step,
-            picture=picture,
+            model=model,
             descent=descent_state,
             search=search,
             terminate=small | lost,
@@ -245,29 +220,29 @@ class TangentSolver(optx.AbstractLeastSquaresSolver):
         )
         return y, state, None
 
-    def _small(self, y: Any, picture: _Picture, step: Float[Array, " d"]) -> Bool[Array, ""]:
-        """Whether a step is too small to matter: against the cost, or against the value."""
-        decrease = -0.5 * jnp.sum(picture.gradient * step)
-        size = jnp.max(jnp.abs(picture.scale * step))
+    def _small(self, y: Any, model: _QuadraticModel, step: Float[Array, " d"]) -> Bool[Array, ""]:
+        """Whether a step is negligible, relative to the cost or to the value."""
+        decrease = -0.5 * jnp.sum(model.gradient * step)
+        size = jnp.max(jnp.abs(model.scale * step))
         largest = jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(y)]))
-        return (decrease <= self.rtol * picture.cost) | (size <= self.atol * (1.0 + largest))
+        return (decrease <= self.rtol * model.cost) | (size <= self.atol * (1.0 + largest))
 
     def terminate(self, fn, y, args, options, state: _State, tags):
-        """Whether the next step would be too small to matter."""
+        """Whether the next step would be negligible."""
         return state.terminate, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state: _State, tags, result):
-        """Takes the last step, too small to need another evaluation, and says how it ended."""
+        """Takes the last step without another evaluation, and determines the status."""
         done = state.terminate & (state.status == int(Status.CONVERGED))
-        last = retract(y, jnp.where(done, state.picture.scale * state.step, 0.0))
+        last = retract(y, jnp.where(done, state.model.scale * state.step, 0.0))
         status = jnp.where(state.terminate, state.status, int(Status.MAX_STEPS))
-        status = jnp.where(state.picture.cost > state.first_cost * 1.001, int(Status.DIVERGED), status)
-        deficient = factor(state.picture.hessian).deficient & (status <= int(Status.MAX_STEPS))
+        status = jnp.where(state.model.cost > state.first_cost * 1.001, int(Status.DIVERGED), status)
+        deficient = factor(state.model.hessian).deficient & (status <= int(Status.MAX_STEPS))
         status = jnp.where(deficient, int(Status.RANK_DEFICIENT), status)
         problem, rest = args
-        senseless = done & ~problem.admissible(eqx.combine(last, rest)) & ~deficient
-        status = jnp.where(senseless, int(Status.INADMISSIBLE), status)
-        finite = jnp.isfinite(state.picture.cost) & jnp.all(jnp.isfinite(state.picture.hessian))
+        inadmissible = done & ~problem.admissible(eqx.combine(last, rest)) & ~deficient
+        status = jnp.where(inadmissible, int(Status.INADMISSIBLE), status)
+        finite = jnp.isfinite(state.model.cost) & jnp.all(jnp.isfinite(state.model.hessian))
         status = jnp.where(finite, status, int(Status.NONFINITE))
         return last, aux, {"status": status.astype(int)}
 
@@ -285,10 +260,6 @@ def _weighted_rows(problem: Problem, y: Any, scale: Float[Array, " d"]) -> tuple
     return jnp.concatenate(residuals), jnp.concatenate(jacobians)
 
 
-def _where(accept: Bool[Array, ""], new: Any, old: Any) -> Any:
-    return tree.where(accept, new, old)
-
-
 def _as(leaf: Any, dtype: Any) -> Any:
-    """Optimistix starts some scalars in the default dtype; the problem's rules here."""
+    """The leaf in the problem's dtype: optimistix creates some scalars in the default one."""
     return leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf

@@ -1,4 +1,4 @@
-"""Graduated non-convexity: robust problems from a bad start, by kernels that begin wide."""
+"""Graduated non-convexity: robust least squares from a poor initial value, by kernels of decreasing scale."""
 
 from typing import Any
 
@@ -23,17 +23,17 @@ def solve_graduated(
     solver: Solver = GaussNewton(),
     max_steps: int = 50,
 ) -> Estimate:
-    """Minimizes a robust problem through a series of wider kernels.
+    """Minimizes a robust problem by a sequence of kernels of decreasing scale.
 
-    A redescending kernel has a minimum for every group of outliers that agree. With its scale multiplied by a large
-    factor the objective is nearly convex; a few steps at each smaller factor follow its minimum into the right one.
+    A redescending kernel may have a local minimum at every group of consistent outliers. With its scale multiplied by a
+    large factor the objective is nearly convex; a few steps at each smaller factor track its minimum.
 
     Args:
         problem: a problem whose field ``loss`` holds its kernels.
-        initial: where to start.
-        factors: scale factors, from wide to narrow; 1 comes by itself.
+        initial: initial value.
+        factors: scale factors, descending; 1 is added at the end.
         steps_each: solver steps at each factor.
-        solver: how to minimize.
+        solver: `GaussNewton`, `LevenbergMarquardt` or `Dogleg`.
         max_steps: bound on the steps of the last stage.
 
     Returns:
@@ -45,10 +45,10 @@ def solve_graduated(
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
-        >>> def spread(state, data):
+        >>> def deviations(state, data):
         ...     return state - data
         >>> data = jnp.array([1.0, 1.1, 0.9, 1.05, 30.0, 40.0])
-        >>> problem = jl.solvers.FunctionProblem(spread, data, jl.solvers.GemanMcClure(1.0))
+        >>> problem = jl.solvers.FunctionProblem(deviations, data, jl.solvers.GemanMcClure(1.0))
         >>> round(float(jl.solvers.solve_graduated(problem, jnp.array(20.0)).value), 2)
         1.01
     """
@@ -59,7 +59,7 @@ def solve_graduated(
         wide = eqx.tree_at(lambda p: p.loss, problem, widened)
         return minimize(wide, value, solver, steps_each)[0], None
 
-    start = jax.tree.map(lambda leaf: jax.lax.stop_gradient(jnp.asarray(leaf)), initial)
-    dtype = jnp.result_type(*[leaf for leaf in jax.tree.leaves(start) if eqx.is_inexact_array(leaf)])
-    start, _ = jax.lax.scan(stage, start, jnp.asarray(factors, dtype))
-    return solve(problem, start, solver=solver, max_steps=max_steps)
+    initial = jax.tree.map(lambda leaf: jax.lax.stop_gradient(jnp.asarray(leaf)), initial)
+    dtype = jnp.result_type(*[leaf for leaf in jax.tree.leaves(initial) if eqx.is_inexact_array(leaf)])
+    initial, _ = jax.lax.scan(stage, initial, jnp.asarray(factors, dtype))
+    return solve(problem, initial, solver=solver, max_steps=max_steps)

@@ -1,8 +1,8 @@
-"""Alignment of corresponding points without iterations, in the plane and in space.
+"""Closed-form alignment of corresponding points, in the plane and in space.
 
 The rotation of space is the eigenvector of Horn's 4x4 matrix to its largest eigenvalue. No derivative passes through
-the eigenvalue problem, where equal eigenvalues would make it infinite: the answer is the minimum of a least-squares
-problem, and has the derivatives of one.
+the eigenvalue problem, where equal eigenvalues would make it infinite: derivatives are those of the minimum of a
+least-squares problem.
 
 References:
     Horn, "Closed-form solution of absolute orientation using unit quaternions", JOSA A 1987 [K-48].
@@ -16,21 +16,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE2, SE3, SO2, SO3
 from jaxloc.solvers.cholesky import rank_tolerance
 from jaxloc.solvers.estimate import Estimate, Status
-from jaxloc.solvers.least_squares import attach_gradient, covariance, trusted
+from jaxloc.solvers.implicit_gradient import attach_gradient
+from jaxloc.solvers.least_squares import StationaryPoint, covariance
 from jaxloc.solvers.problem import Problem, normal_equations
 from jaxloc.solvers.robust_kernels import Quadratic
 
 
 class Similarity(eqx.Module):
-    """A rigid motion after a change of scale: ``x_a = scale R x_b + t``.
+    """A similarity transform: ``x_a = scale R x_b + t``.
 
     Attributes:
         pose: rotation and translation.
-        scale: factor of all lengths.
+        scale: scale factor.
     """
 
     pose: SE2 | SE3
@@ -47,7 +49,7 @@ class PointAlignment(Problem):
     Attributes:
         source: "n k", m; finite everywhere.
         target: "n k", m; finite everywhere.
-        whitening: one over the standard deviation of a coordinate of the difference; zero for points that do not count.
+        whitening: one over the standard deviation of a coordinate of the difference; zero for invalid points.
         loss: robust kernel over the k components of an item.
     """
 
@@ -70,15 +72,15 @@ def align_points(
     valid: Bool[Array, " n"] | None = None,
     sigma: Any = 1.0,
 ) -> Estimate:
-    """Rigid motion that brings points onto their partners, in closed form.
+    """Rigid motion that aligns corresponding points, in closed form.
 
     Minimizes ``sum w_i |T s_i - t_i|^2 / (2 sigma^2)`` over the pose ``T = T_target_source``.
 
     Args:
         source: "n 2" or "n 3", m.
-        target: the partners, in their frame, m.
-        weights: relative information of each pair, one by default; pairs with weight zero do not count.
-        valid: which pairs count; numbers of others, nan too, have no influence.
+        target: the corresponding points, m.
+        weights: relative information of each pair, one by default; pairs of weight zero are invalid.
+        valid: mask of the pairs; values of invalid pairs, NaN included, have no influence.
         sigma: standard deviation of a coordinate of the difference at weight one, m.
 
     Returns:
@@ -111,16 +113,16 @@ def align_scaled_points(
     valid: Bool[Array, " n"] | None = None,
     sigma: Any = 1.0,
 ) -> Estimate:
-    """Rigid motion and scale that bring points onto their partners, in closed form.
+    """Rigid motion and scale that align corresponding points, in closed form.
 
-    Minimizes ``sum w_i |scale R s_i + t - t_i|^2 / (2 sigma^2)``: what aligns the paths of one camera, whose scale is
-    free.
+    Minimizes ``sum w_i |scale R s_i + t - t_i|^2 / (2 sigma^2)``: for instance to align monocular
+    trajectories, whose scale is free.
 
     Args:
         source: "n 2" or "n 3", m or any unit.
-        target: the partners, in their frame, m.
-        weights: relative information of each pair, one by default; pairs with weight zero do not count.
-        valid: which pairs count; numbers of others, nan too, have no influence.
+        target: the corresponding points, m.
+        weights: relative information of each pair, one by default; pairs of weight zero are invalid.
+        valid: mask of the pairs; values of invalid pairs, NaN included, have no influence.
         sigma: standard deviation of a coordinate of the difference at weight one, m.
 
     Returns:
@@ -141,15 +143,15 @@ def align_scaled_points(
     """
     problem, weight = _problem(source, target, weights, valid, sigma)
     pose, scale, determined = _umeyama(problem.source, problem.target, weight)
-    center = _center(problem.source, weight)
-    # The rigid translation brings the centers together; the scaled one has to do so as well.
+    center = _centroid(problem.source, weight)
+    # The rigid translation aligns the centroids; the scaled one has to do so as well.
     shift = (1.0 - scale) * pose.rotation.apply(center[None])[0]
     moved = eqx.tree_at(lambda p: p.translation, pose, pose.translation + shift)
     return _estimate(problem, Similarity(moved, scale), determined)
 
 
 def _problem(source: Array, target: Array, weights: Any, valid: Any, sigma: Any) -> tuple[PointAlignment, Array]:
-    """The problem with bad numbers replaced, and weights without derivatives for the closed form."""
+    """The problem with invalid values replaced, and weights without derivatives for the closed form."""
     if source.shape[1] not in {2, 3}:
         raise ValueError(f"Points have 2 or 3 coordinates; these have {source.shape[1]}.")
     usable = jnp.all(jnp.isfinite(source), axis=1) & jnp.all(jnp.isfinite(target), axis=1)
@@ -161,7 +163,7 @@ def _problem(source: Array, target: Array, weights: Any, valid: Any, sigma: Any)
     return PointAlignment(source, target, root), jax.lax.stop_gradient(jnp.where(usable, weight, 0.0))
 
 
-def _center(points: Float[Array, "n k"], weight: Float[Array, " n"]) -> Float[Array, " k"]:
+def _centroid(points: Float[Array, "n k"], weight: Float[Array, " n"]) -> Float[Array, " k"]:
     total = jnp.sum(weight)
     return matmul(weight, jax.lax.stop_gradient(points)) / jnp.where(total > 0, total, 1.0)
 
@@ -171,27 +173,27 @@ def _umeyama(
 ) -> tuple[SE2 | SE3, Float[Array, ""], Bool[Array, ""]]:
     """Pose, scale, and whether they are determined; without derivatives."""
     source, target = jax.lax.stop_gradient((source, target))
-    from_center, to_center = _center(source, weight), _center(target, weight)
+    from_center, to_center = _centroid(source, weight), _centroid(target, weight)
     counted = jnp.where(weight > 0, 1.0, 0.0).astype(source.dtype)[:, None]
     s, t = (source - from_center[None, :]) * counted, (target - to_center[None, :]) * counted
-    spread_s, spread_t = (jnp.sum(weight[:, None] * c**2) for c in (s, t))
+    variance_s, variance_t = (jnp.sum(weight[:, None] * c**2) for c in (s, t))
     cross = matmul((s * weight[:, None]).T, t)
-    rotation, gap = (_turn if source.shape[1] == 2 else _horn)(cross)
+    rotation, gap = (_planar_rotation if source.shape[1] == 2 else _horn)(cross)
     moved = rotation.apply(s)
-    alike = jnp.sum(weight[:, None] * moved * t)
-    scale = jnp.where(alike > 0, alike, 1.0) / jnp.where((alike > 0) & (spread_s > 0), spread_s, 1.0)
-    # Spreads of no more than rounding are none.
+    product = jnp.sum(weight[:, None] * moved * t)
+    scale = jnp.where(product > 0, product, 1.0) / jnp.where((product > 0) & (variance_s > 0), variance_s, 1.0)
+    # Variances at rounding level count as zero.
     rounding = 8.0 * float(jnp.finfo(source.dtype).eps)
     floor = [jnp.sum(weight) * (rounding * jnp.max(jnp.abs(c))) ** 2 for c in (source, target)]
-    size = jnp.sqrt(spread_s) * jnp.sqrt(spread_t)
-    determined = (spread_s > floor[0]) & (spread_t > floor[1]) & (gap > rank_tolerance(source.dtype) * size)
+    size = jnp.sqrt(variance_s) * jnp.sqrt(variance_t)
+    determined = (variance_s > floor[0]) & (variance_t > floor[1]) & (gap > rank_tolerance(source.dtype) * size)
     translation = to_center - rotation.apply(from_center[None])[0]
     pose = SE2.from_parts(rotation, translation) if source.shape[1] == 2 else SE3(rotation, translation)
     return pose, scale, determined
 
 
-def _turn(cross: Float[Array, "2 2"]) -> tuple[SO2, Float[Array, ""]]:
-    """The rotation of the plane, and how much the cost rises away from it."""
+def _planar_rotation(cross: Float[Array, "2 2"]) -> tuple[SO2, Float[Array, ""]]:
+    """The planar rotation, and the curvature of the cost at it."""
     cos, sin = cross[0, 0] + cross[1, 1], cross[0, 1] - cross[1, 0]
     length = jnp.sqrt(cos**2 + sin**2)
     known = length > 0
@@ -200,7 +202,7 @@ def _turn(cross: Float[Array, "2 2"]) -> tuple[SO2, Float[Array, ""]]:
 
 
 def _horn(cross: Float[Array, "3 3"]) -> tuple[SO3, Float[Array, ""]]:
-    """The rotation of space, and the gap between the two largest eigenvalues: zero for points on a line."""
+    """The rotation in space, and the gap between the two largest eigenvalues: zero for collinear points."""
     trace = jnp.trace(cross)
     symmetric = cross + cross.T - trace * jnp.eye(3, dtype=cross.dtype)
     axis = jnp.stack([cross[1, 2] - cross[2, 1], cross[2, 0] - cross[0, 2], cross[0, 1] - cross[1, 0]])
@@ -211,9 +213,9 @@ def _horn(cross: Float[Array, "3 3"]) -> tuple[SO3, Float[Array, ""]]:
 
 
 def _estimate(problem: PointAlignment, found: Any, determined: Bool[Array, ""]) -> Estimate:
-    problem = trusted(problem, determined)
-    value = attach_gradient(found, problem, determined)
+    problem = tree.detach_unless(determined, problem)
+    value = attach_gradient(found, StationaryPoint(problem), determined)
     normal = normal_equations(problem, value)
     status = jnp.where(determined, int(Status.CONVERGED), int(Status.RANK_DEFICIENT)).astype(int)
-    spread = covariance(problem, value, normal, determined)
-    return Estimate(value, spread, normal.cost, determined, jnp.zeros((), int), status, normal.hessian)
+    noise = covariance(problem, value, normal, determined)
+    return Estimate(value, noise, normal.cost, determined, jnp.zeros((), int), status, normal.hessian)

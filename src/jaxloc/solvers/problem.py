@@ -1,4 +1,4 @@
-"""What is to be solved: a whitened residual with its data, and its normal equations."""
+"""Least-squares problems: a whitened residual with its data, normal equations and robust covariance."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from jaxloc.solvers.robust_kernels import Loss, Quadratic
 
 
 class Linearization(NamedTuple):
-    """A residual and how it moves with the tangent of the state.
+    """A residual and its Jacobian by the tangent of the state.
 
     Attributes:
         residual: whitened, a pytree of arrays whose last axis runs over items (points, lines, ...).
@@ -28,11 +28,11 @@ class Linearization(NamedTuple):
 
 
 class Problem(eqx.Module):
-    """A whitened residual with its data: a pytree, so that new numbers never compile anew.
+    """A least-squares problem: a whitened residual with its data, a pytree, so that new values never recompile.
 
-    A residual is an array, or a pytree of arrays, in sigmas. The last axis runs over items, the axes before it over the
-    components of one item; the loss acts on the squared norm of an item. ``loss`` is one kernel, or a pytree of kernels
-    that is a prefix of the residual's.
+    A residual is an array, or a pytree of arrays, over its standard deviation. The last axis runs over items, the axes
+    before it over the components of one item; the loss acts on the squared norm of an item. ``loss`` is one kernel, or
+    a pytree of kernels that is a prefix of the residual's.
 
     Subclasses give ``residual`` and ``loss``, and may give ``linearize`` where the Jacobian is short in closed form.
     """
@@ -50,14 +50,14 @@ class Problem(eqx.Module):
         return Linearization(residual, jax.vmap(push)(jnp.eye(zero.size, dtype=zero.dtype)))
 
     def admissible(self, state: Any) -> Bool[Array, ""]:
-        """Whether a minimum makes sense under the model; True unless overridden."""
+        """Whether a minimum is consistent with the model; True unless overridden."""
         del state
         return jnp.array(True)
 
     def hessian(self, state: Any) -> Float[Array, "d d"]:
-        """Exact Hessian of the cost along the tangent at a minimum, kernels included: what derivatives of it need.
+        """Exact Hessian of the cost along the tangent at a minimum, kernels included, for implicit derivatives.
 
-        By forward over reverse differentiation, one direction after the other, unless overridden.
+        By forward-over-reverse differentiation, one direction at a time, unless overridden.
         """
         zero = jnp.zeros(tangent_dimension(state), float_dtype(state))
         slope = jax.grad(lambda delta: cost_along(self, state, delta))
@@ -67,8 +67,8 @@ class Problem(eqx.Module):
 class FunctionProblem(Problem):
     """A problem of a plain function ``residual(state, data)``.
 
-    The function is static: define it once at module level (a fresh lambda for every call would be compiled every time),
-    and let everything that changes travel in ``data``.
+    The function is static: define it once at module level (a new lambda for every call would be compiled every time),
+    and pass everything that changes in ``data``.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -89,20 +89,20 @@ class FunctionProblem(Problem):
 
 
 class NormalEquations(NamedTuple):
-    """Second-order image of the cost about a state.
+    """Normal equations of a linearized problem.
 
     Attributes:
         cost: sum of rho.
         gradient: of the cost along the tangent.
         hessian: of the cost, in the Gauss-Newton form with IRLS weights: an upper bound, safe far from the minimum.
-        bend: what the falling weights of robust kernels take off the Hessian, no more than leaves it positive; None for
-            plain least squares. With it, steps near the minimum converge as fast as Newton's.
+        correction: curvature correction of robust kernels (negative), bounded so that the Hessian stays positive; None
+            for plain least squares. With it, steps near the minimum converge as fast as Newton's.
     """
 
     cost: Float[Array, ""]
     gradient: Float[Array, " d"]
     hessian: Float[Array, "d d"]
-    bend: Float[Array, "d d"] | None
+    correction: Float[Array, "d d"] | None
 
 
 def float_dtype(state: Any) -> Any:
@@ -115,7 +115,7 @@ def _is_loss(node: Any) -> bool:
 
 
 def with_losses(loss: Any, *trees: Any) -> list[tuple]:
-    """The kernel beside each array of the residual (and of trees with the same structure)."""
+    """Pairs of a kernel and each array of the residual (and of trees with the same structure)."""
     pairs: list[tuple] = []
 
     def collect(kernel: Loss, *parts: Any) -> None:
@@ -154,9 +154,9 @@ def normal_equations(problem: Problem, state: Any) -> NormalEquations:
     ]
     if not parts:
         raise ValueError("The residual holds no array: there is nothing to solve.")
-    costs, gradients, hessians, bends = zip(*parts, strict=True)
-    bends = [bend for bend in bends if bend is not None]
-    return NormalEquations(_total(costs), _total(gradients), _total(hessians), _total(bends) if bends else None)
+    costs, gradients, hessians, corrections = zip(*parts, strict=True)
+    present = [part for part in corrections if part is not None]
+    return NormalEquations(_total(costs), _total(gradients), _total(hessians), _total(present) if present else None)
 
 
 def _total(parts: Any) -> Array:
@@ -174,11 +174,11 @@ def _normal_part(kernel: Loss, r: Float[Array, "k n"], j: Float[Array, "d k n"])
     weight, slope = _weight_and_slope(kernel, squared)
     product = matmul((stacked * weight[None, None, :]).reshape(size, -1), stacked.reshape(size, -1).T)
     score = jnp.sum(j * r[None], axis=1)
-    # At least a tenth of the weight is left along the residual.
+    # At least a tenth of the weight remains along the residual.
     least = -0.9 * weight / jnp.where(squared > 0, squared, 1.0)
     fall = jnp.where(squared > 0, jnp.maximum(2.0 * slope, least), 0.0)
-    bend = matmul(score * fall[None, :], score.T)
-    return NormalEquations(jnp.sum(kernel.rho(squared)), product[:-1, -1], product[:-1, :-1], bend)
+    correction = matmul(score * fall[None, :], score.T)
+    return NormalEquations(jnp.sum(kernel.rho(squared)), product[:-1, -1], product[:-1, :-1], correction)
 
 
 def _weight_and_slope(kernel: Loss, squared: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
@@ -187,12 +187,12 @@ def _weight_and_slope(kernel: Loss, squared: Float[Array, " n"]) -> tuple[Float[
 
 
 class _Scores(NamedTuple):
-    """What one block of residuals adds to the sandwich.
+    """Contribution of one block of residuals to the sandwich estimator.
 
     Attributes:
         bread: curvature of its cost.
         score: derivative of each item's cost along the tangent; None for plain least squares.
-        leverage: function of the inverse bread: the share that each item has in its own fit.
+        leverage: function of the inverse bread: the leverage of each item.
     """
 
     bread: Float[Array, "d d"]
@@ -201,11 +201,11 @@ class _Scores(NamedTuple):
 
 
 def sandwich(problem: Problem, state: Any) -> tuple[Float[Array, "d d"], Float[Array, "d d"]]:
-    """Bread and meat of the covariance ``A^-1 B A^-1`` of an M-estimate.
+    """Bread and meat of the sandwich covariance ``A^-1 B A^-1`` of an M-estimate.
 
     Items under a quadratic loss obey the noise model: their ``B`` equals their ``A = J^T J``. Items under a robust
-    kernel need not, so ``A`` is the curvature of rho and ``B`` the spread of the scores that were seen, each over one
-    minus its item's leverage: the fit has drawn every residual towards zero (the third kind of MacKinnon and White).
+    kernel need not, so ``A`` is the curvature of rho and ``B`` the empirical covariance of the scores, each over one
+    minus its item's leverage, since the fit reduces every residual (HC3 of MacKinnon and White).
 
     References:
         Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 1967.

@@ -1,4 +1,4 @@
-"""Consensus among outliers: many small samples, each fitted and scored at once."""
+"""RANSAC: random sample consensus with the MSAC score, all hypotheses in one batch."""
 
 from collections.abc import Callable
 from math import ceil, log
@@ -211,7 +211,7 @@ def sample_indices(key: Key[Array, ""], valid: Bool[Array, " n"], size: int, cou
 
 
 def required_hypotheses(inlier_fraction: float, sample_size: int, *, confidence: float = 0.99) -> int:
-    """How many samples make it sure, to a confidence, that one of them holds inliers only.
+    """Number of samples of which, to a confidence, at least one holds inliers only.
 
     ``log(1 - confidence) / log(1 - inlier_fraction^sample_size)`` [K-61].
 

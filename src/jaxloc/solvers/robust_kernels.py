@@ -54,7 +54,7 @@ class Quadratic(Loss):
 
 
 class Huber(Loss):
-    """Quadratic within the scale, linear beyond; convex."""
+    """Huber kernel: quadratic within the scale, linear beyond; convex."""
 
     scale: Float[Array, ""]
 
@@ -78,7 +78,7 @@ class Huber(Loss):
 
 
 class Cauchy(Loss):
-    """Logarithmic growth: outliers keep a little pull."""
+    """Cauchy (Lorentzian) kernel: logarithmic growth."""
 
     scale: Float[Array, ""]
 
@@ -100,9 +100,9 @@ class Cauchy(Loss):
 
 
 class GemanMcClure(Loss):
-    """Bounded cost: far outliers lose all pull.
+    """Geman-McClure kernel: bounded cost, so that far outliers have no influence.
 
-    Groups of outliers that agree make minima of their own: from a start that is far off, use `solve_graduated`.
+    Groups of consistent outliers create local minima: from a distant initial value, use `solve_graduated`.
     """
 
     scale: Float[Array, ""]
@@ -124,7 +124,7 @@ class GemanMcClure(Loss):
 
 
 class Tukey(Loss):
-    """Bisquare: residuals beyond the scale count nothing at all."""
+    """Tukey's bisquare kernel: residuals beyond the scale have zero weight."""
 
     scale: Float[Array, ""]
 
@@ -150,7 +150,7 @@ class Tukey(Loss):
 
 
 class Barron(Loss):
-    """The general kernel: shape 2 is quadratic, 1 pseudo-Huber, 0 Cauchy, -2 Geman-McClure, to -inf Welsch.
+    """Barron's general kernel: shape 2 is quadratic, 1 pseudo-Huber, 0 Cauchy, -2 Geman-McClure, to -inf Welsch.
 
     The shape may be learned: value and gradient are smooth through 0 and 2.
     """

@@ -11,7 +11,7 @@ from jaxloc.tracking.models.birth import Birth, MeasuredBirth, PointBirth, Stati
 from jaxloc.tracking.models.clutter import Clutter, FrustumClutter, UniformClutter
 from jaxloc.tracking.models.target import ConstantDetection, Detection, FieldOfView, TargetModel
 from jaxloc.tracking.pda import Association, ProbabilisticDataAssociation
-from jaxloc.tracking.tracks import CountLife, ExistenceLife, Life, Tracks
+from jaxloc.tracking.tracks import ExistenceLogic, HistoryLogic, TrackLogic, Tracks
 
 __all__ = [
     "Association",
@@ -19,11 +19,11 @@ __all__ = [
     "Birth",
     "Clutter",
     "ConstantDetection",
-    "CountLife",
+    "HistoryLogic",
     "CphdState",
     "Detection",
     "Exact",
-    "ExistenceLife",
+    "ExistenceLogic",
     "FieldOfView",
     "FrustumClutter",
     "GlobalNearestNeighbor",
@@ -31,7 +31,7 @@ __all__ = [
     "GmPhd",
     "Hypotheses",
     "JointProbabilisticDataAssociation",
-    "Life",
+    "TrackLogic",
     "Marginals",
     "MeasuredBirth",
     "MultipleHypothesisTracker",

@@ -1,4 +1,4 @@
-"""The cardinalized PHD filter: the intensity, and beside it the distribution of how many targets there are.
+"""Cardinalized PHD filter: the intensity of targets together with the distribution of their number.
 
 The update is the derivative of one function. With ``phi`` the expected number of missed targets and ``Lambda_z`` the
 ratio of targets to clutter at a measurement, the log-likelihood of a scan is ``l(phi, Lambda)``; the weights of missed
@@ -16,11 +16,13 @@ from jax import lax
 from jax.scipy.special import gammaln, logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
 from jaxloc.beliefs import Mixture
 from jaxloc.filters import FilterState
-from jaxloc.filters.kalman import finite_or_zero
-from jaxloc.tracking.gating import compare, count_valid, with_room
-from jaxloc.tracking.gmphd import Evidence, GmPhd, choose, predict, reduce_counted, safe_log, tell_apart
+from jaxloc.tracking import intensity
+from jaxloc.tracking.gating import at_least_one, compare, usable_measurements
+from jaxloc.tracking.gmphd import GmPhd
+from jaxloc.tracking.intensity import Evidence, safe_log
 from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
 from jaxloc.tracking.models.birth import MeasuredBirth
 
@@ -28,13 +30,13 @@ _NEVER = -1e15  # a logarithm of zero whose multiples stay finite
 
 
 class CphdState(FilterState):
-    """What the next step of a CPHD filter needs.
+    """State of the CPHD filter.
 
     Attributes:
         mixture: the intensity.
         cardinality: probability of each number of targets from 0.
-        step: how many predictions led here.
-        num_labels: how many tracks have been numbered.
+        step: number of predictions so far.
+        num_labels: number of labels given so far.
     """
 
     mixture: Mixture
@@ -44,14 +46,14 @@ class CphdState(FilterState):
 
 
 class GmCphd(Tracker):
-    """The Gaussian mixture CPHD filter.
+    """The Gaussian mixture cardinalized PHD (CPHD) filter.
 
-    Its number of targets is steadier than the PHD filter's, which has as large a variance as mean. The price is the
+    Its estimate of the number of targets has less variance than the PHD filter's (equal to its mean). The price is the
     "spooky effect": when a target is missed, weight moves to targets that were measured, however far away [T-76].
 
     Args:
-        phd: model and options, as of the PHD filter. Births at known places only.
-        max_targets: the largest number of targets thought possible.
+        phd: a PHD filter, for its model and options. Births at known places only.
+        max_targets: largest number of targets in the distribution.
 
     Raises:
         ValueError: if targets are born with measurements.
@@ -77,32 +79,32 @@ class GmCphd(Tracker):
     def predict(self, state: CphdState, control: Any, *, key: Key[Array, ""] | None = None) -> CphdState:
         """Each target survives by itself; births are a Poisson number."""
         del key
-        mixture = predict(state.mixture, self.phd, control, first_label=state.num_labels)
+        phd, first = self.phd, state.num_labels
+        mixture = intensity.predict(state.mixture, phd.model, control, first_label=first, spawning=phd.spawning)
         born = mixture.weights[state.mixture.capacity :]
         survivors = survive(state.cardinality, self.phd.model.survival)
         births = _poisson(jnp.sum(born), self.max_targets)
         sums = jnp.convolve(survivors, births, precision="highest")[: self.max_targets + 1]
         sums = sums / jnp.sum(sums)
-        return CphdState(mixture, sums, state.step + 1, state.num_labels + born.shape[0])
+        return CphdState(mixture, sums, state.step + 1, first + born.shape[0])
 
     def update(
         self, state: CphdState, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[CphdState, TrackerInfo]:
         """The intensity and the cardinality given a scan."""
         del key
-        measurement, valid = with_room(measurement, valid)
+        measurement, valid = at_least_one(measurement, valid)
         evidence, cardinality = self._weigh(state, measurement, valid)
         first = state.num_labels
-        chosen = choose(state.mixture, measurement, evidence, self.phd, first_label=first)
-        reduced, crowded = reduce_counted(chosen, evidence, self.phd)
-        reduced = tell_apart(reduced, _most_probable(reduced, cardinality), first)
+        reduced, crowded = self.phd.reduced(state.mixture, measurement, evidence, first)
+        reduced = intensity.make_labels_unique(reduced, _most_probable(reduced, cardinality), first)
         ok = jnp.isfinite(evidence.log_likelihood)
         count = jnp.sum(cardinality * jnp.arange(cardinality.shape[0], dtype=cardinality.dtype))
         info = TrackerInfo(jnp.where(ok, evidence.log_likelihood, 0.0), ok, count, crowded)
         return CphdState(reduced, cardinality, state.step, first + self.phd.capacity), info
 
     def extract(self, state: CphdState) -> Targets:
-        """As many of the heaviest components as there are most probably targets."""
+        """The heaviest components, as many as the most probable number of targets."""
         kept = state.mixture.take(jnp.argsort(-state.mixture.weights))
         there = _most_probable(kept, state.cardinality)
         return Targets(kept.means, kept.covariances, kept.weights, kept.labels, there)
@@ -111,8 +113,8 @@ class GmCphd(Tracker):
         self, state: CphdState, measurements: Any, valid: Bool[Array, " m"]
     ) -> tuple[Evidence, Float[Array, " n"]]:
         model, mixture = self.phd.model, state.mixture
-        valid = count_valid(measurements, valid)
-        measurements = finite_or_zero(measurements)
+        valid = usable_measurements(measurements, valid)
+        measurements = tree.finite_or_zero(measurements)
         comparison = compare(model.filter, mixture.means, mixture.roots(), measurements, valid, self.phd.gate)
         expected = jax.vmap(model.detection.probability)(mixture.means) * mixture.weights
         pairs = safe_log(expected)[:, None] + comparison.log_likelihood
@@ -145,7 +147,7 @@ class GmCphd(Tracker):
 
 
 def survive(cardinality: Float[Array, " n"], survival: Float[Array, ""]) -> Float[Array, " n"]:
-    """Distribution of how many are left, when each survives by itself: binomial thinning.
+    """Distribution of the number of survivors when targets survive independently (binomial thinning).
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -183,7 +185,7 @@ def symmetric_functions(logs: Float[Array, " m"], order: int) -> Float[Array, " 
 
 
 def _most_probable(mixture: Mixture, cardinality: Float[Array, " n"]) -> Bool[Array, " k"]:
-    """Which components are targets, of sorted ones."""
+    """Which components of a sorted mixture are targets."""
     return (jnp.arange(mixture.capacity) < jnp.argmax(cardinality)) & mixture.valid
 
 
@@ -195,7 +197,7 @@ def _poisson(mean: Float[Array, ""], largest: int) -> Float[Array, " n"]:
 
 
 class _Terms(eqx.Module):
-    """Log weights of n targets with j of them measured; the exponents of the expected number of missed ones."""
+    """Log weights of n targets of which j are measured; the exponents of the expected number of missed ones."""
 
     logs: Float[Array, "n j"]
     missed: Float[Array, "n j"]

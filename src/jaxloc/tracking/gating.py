@@ -1,4 +1,4 @@
-"""Predicted targets beside measurements: how likely each pair is, and what each measurement would make of a target."""
+"""Gating: likelihoods and innovations of all pairs of predicted targets and measurements."""
 
 import math
 from typing import Any
@@ -8,22 +8,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import chi2_quantile
 from jaxloc.beliefs.models import innovation
 from jaxloc.beliefs.square_root import product, whiten
 from jaxloc.filters import GaussianState
-from jaxloc.filters.kalman import GaussianFilter, finite_or_zero, recenter, regular
+from jaxloc.filters.kalman import GaussianFilter, retract_root, without_zero_pivots
 
 
 class Comparison(eqx.Module):
-    """Every target beside every measurement.
+    """All pairs of targets and measurements.
 
     Attributes:
-        log_likelihood: ``log N(z; h(x), S)``; minus infinity where there is no measurement or none inside the gate.
+        log_likelihood: ``log N(z; h(x), S)``; minus infinity for invalid measurements and outside the gate.
         squared: Mahalanobis distance squared.
         inside: whether a pair passes the gate.
-        residuals: ``S^-1/2 (z - h(x))``: innovations in sigmas.
+        residuals: whitened innovations ``S^-1/2 (z - h(x))``.
         roots: root of the covariance of (measurement, state) of each target.
     """
 
@@ -39,20 +40,20 @@ class Comparison(eqx.Module):
         return matmul(self.roots[:, :size, :size], self.roots[:, :size, :size].mT)
 
     def rest(self) -> Float[Array, "k d d"]:
-        """Roots of the covariances after a measurement, whichever it is: none is stored for a pair."""
+        """Posterior covariance roots of the targets, the same for every measurement."""
         size = self.residuals.shape[-1]
         return self.roots[:, size:, size:]
 
 
-def with_room(measurements: Any, valid: Bool[Array, " m"]) -> tuple[Any, Bool[Array, " slots"]]:
-    """The measurements with at least one slot, so that there is an example of them where there are none."""
+def at_least_one(measurements: Any, valid: Bool[Array, " m"]) -> tuple[Any, Bool[Array, " slots"]]:
+    """The measurements padded to at least one slot, so that code on their first entry works for empty sets."""
     if valid.shape[0] > 0:
         return measurements, valid
     return jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), measurements), jnp.zeros(1, bool)
 
 
-def count_valid(measurements: Any, valid: Bool[Array, " m"]) -> Bool[Array, " m"]:
-    """Which measurements there are: those that are valid, and finite in all their numbers."""
+def usable_measurements(measurements: Any, valid: Bool[Array, " m"]) -> Bool[Array, " m"]:
+    """Mask of the measurements that are valid and finite."""
     leaves = [leaf for leaf in jax.tree.leaves(measurements) if eqx.is_inexact_array(leaf)]
     for leaf in leaves:
         valid = valid & jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim)))
@@ -67,36 +68,38 @@ def compare(
     valid: Bool[Array, " m"],
     gate: float | None = None,
 ) -> Comparison:
-    """Every target beside every measurement; what does not depend on the measurement is worked out once a target.
+    """Compares every target with every measurement; covariances are computed once per target.
 
     Args:
-        filt: how a target is measured.
+        filt: the filter of one target, for its measurement model.
         means: of the targets, stacked.
         roots: of their covariances.
         measurements: stacked.
-        valid: which of them there are.
+        valid: mask of the measurements.
         gate: probability that a target's own measurement passes; None for no gate.
 
     References:
         Bar-Shalom, Li, Kirubarajan 2001, section 3.3 [T-58], [T-85].
     """
-    valid = count_valid(measurements, valid)
-    measurements = finite_or_zero(measurements)
+    valid = usable_measurements(measurements, valid)
+    measurements = tree.finite_or_zero(measurements)
     template = jax.tree.map(lambda leaf: leaf[0], measurements)
 
     def expect(mean, root):
-        reading = filt.read(GaussianState(mean, root, jnp.zeros((), jnp.int32)), template, jnp.array(True))
-        return reading.spread.mean, reading.spread.root()
+        found = filt.innovation(GaussianState(mean, root, jnp.zeros((), jnp.int32)), template, jnp.array(True))
+        return found.joint.mean, found.joint.root()
 
     expected, both = jax.vmap(expect)(means, roots)
     differences = jax.vmap(lambda center: jax.vmap(lambda z, v: innovation(center, z, v)[0])(measurements, valid))(
         expected
     )
     size = differences.shape[-1]
-    spreads = jax.vmap(regular)(both[:, :size, :size])
-    residuals = jax.vmap(lambda root, rows: whiten(root, rows.T).T)(spreads, differences)
+    measured = jax.vmap(without_zero_pivots)(both[:, :size, :size])
+    residuals = jax.vmap(lambda root, rows: whiten(root, rows.T).T)(measured, differences)
     squared = jnp.sum(residuals**2, axis=-1)
-    volume = jnp.sum(jnp.log(jnp.diagonal(spreads, axis1=-2, axis2=-1)), axis=-1) + 0.5 * size * math.log(2.0 * math.pi)
+    volume = jnp.sum(jnp.log(jnp.diagonal(measured, axis1=-2, axis2=-1)), axis=-1) + 0.5 * size * math.log(
+        2.0 * math.pi
+    )
     inside = jnp.broadcast_to(valid[None, :], squared.shape)
     if gate is not None:
         with jax.ensure_compile_time_eval():
@@ -109,10 +112,10 @@ def compare(
 def corrected(
     means: Any, comparison: Comparison, target: Int[Array, ""], measurement: Int[Array, ""]
 ) -> tuple[Any, Float[Array, "d d"]]:
-    """The state of a target given a measurement: its mean, and the root of its covariance.
+    """Posterior mean and covariance root of a target given a measurement.
 
     Args:
-        means: of the targets, as they were compared.
+        means: of the targets, as given to `compare`.
         comparison: of all pairs.
         target: row of the pair.
         measurement: column of the pair.
@@ -120,4 +123,4 @@ def corrected(
     size = comparison.residuals.shape[-1]
     root = comparison.roots[target]
     delta = product(root[size:, :size], comparison.residuals[target, measurement])
-    return recenter(jax.tree.map(lambda leaf: leaf[target], means), delta, root[size:, size:])
+    return retract_root(jax.tree.map(lambda leaf: leaf[target], means), delta, root[size:, size:])

@@ -1,44 +1,32 @@
-"""Global nearest neighbor: each track takes at most one measurement, by the one best assignment."""
+"""Global nearest neighbor (GNN) tracker: one optimal assignment of measurements to tracks per scan."""
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from jaxloc.beliefs import Mixture
-from jaxloc.filters.kalman import select
+from jaxloc import _tree as tree
 from jaxloc.solvers.assignment import assign
-from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
-from jaxloc.tracking.likelihood_ratio import correct_tracks, examine, whole
-from jaxloc.tracking.models.target import TargetModel
-from jaxloc.tracking.tracks import (
-    ExistenceLife,
-    Life,
-    Tracks,
-    age_tracks,
-    extract_tracks,
-    open_tracks,
-    predict_tracks,
-    renew,
-)
+from jaxloc.tracking.interface import Tracker, TrackerInfo
+from jaxloc.tracking.likelihood_ratio import compare_scan, correct_tracks
+from jaxloc.tracking.tracks import Tracks, TrackTable, age_tracks, manage_tracks
 
 _LARGEST = 60.0  # log odds, beyond which existence is certain to rounding
 
 
-class GlobalNearestNeighbor(Tracker):
-    """One assignment a scan, the most probable one: tracks that take a measurement believe it, the others were missed.
+class GlobalNearestNeighbor(TrackTable, Tracker):
+    """Tracker by the most probable one-to-one assignment of each scan; unassigned tracks count as missed.
 
     A pair costs ``-log r p_D N(z; ...) / (kappa(z) + b(z))``, a track without a measurement ``-log (1 - r p_D)``. The
-    existence of a track is that of integrated data association with the measurement it was given. Measurements that no
-    track takes begin new ones.
+    existence of a track is that of integrated data association with its assigned measurement. Unassigned measurements
+    initiate new tracks.
 
     Args:
-        model: what targets do, and what is seen of them; its filter may be an `InteractingFilters`.
-        capacity: how many tracks there is room for, tentative ones included.
+        model: the target model; its filter may be an `InteractingFilters`.
+        capacity: number of slots for tracks, tentative ones included.
         gate: probability that a track's own measurement passes; None for no gate.
-        life: when tracks are confirmed and deleted.
+        logic: when tracks are confirmed and deleted.
 
     References:
         Blackman and Popoli, *Design and Analysis of Modern Tracking Systems*, 1999, chapter 6 [T-58].
@@ -59,46 +47,28 @@ class GlobalNearestNeighbor(Tracker):
         ([3.0, 33.0], [0, 1])
     """
 
-    model: TargetModel
-    capacity: int = eqx.field(static=True, default=100)
-    gate: float | None = eqx.field(static=True, default=0.999)
-    life: Life = eqx.field(default_factory=ExistenceLife)
-
-    def init(self, prior: Mixture | None) -> Tracks:
-        """Tracks of a prior, whose weights are probabilities; see `open_tracks`."""
-        return open_tracks(self.model, self.capacity, prior, self.life)
-
-    def predict(self, state: Tracks, control: Any, *, key: Key[Array, ""] | None = None) -> Tracks:
-        """Every track one step later."""
-        del key
-        return predict_tracks(self.model, state, control)
-
     def update(
         self, state: Tracks, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[Tracks, TrackerInfo]:
         """The tracks given a scan; the likelihood is that of the chosen assignment."""
         del key
-        scan = examine(self.model, state, measurement, valid, self.gate)
+        scan = compare_scan(self.model, state, measurement, valid, self.gate)
         pairs = jnp.isfinite(scan.log_odds)
         found = assign(-scan.log_odds, pairs, unassigned=-scan.log_missed)
         hit, column = found.columns >= 0, jnp.maximum(found.columns, 0)
         rows = jnp.arange(state.capacity)
         moved = correct_tracks(self.model, state, scan, rows, column)
-        states = jax.vmap(select)(hit, moved, state.states)
+        states = jax.vmap(tree.where)(hit, moved, state.states)
         existence = _existence(state.existence, scan.detection, jnp.where(hit, scan.log_odds[rows, column], -jnp.inf))
         aged = age_tracks(state, states, existence, hit)
-        taken = jnp.zeros(scan.there.shape, bool).at[column].max(hit)
+        taken = jnp.zeros(scan.valid.shape, bool).at[column].max(hit)
         newborn = jnp.where(taken, 0.0, scan.share)
-        after, crowded = renew(aged, scan.newborn.states, newborn, self.life)
+        after, crowded = manage_tracks(aged, scan.newborn.states, newborn, self.logic)
         likelihood = scan.base - found.cost
-        ok = whole(after, likelihood)
-        after = select(ok, after, state)
+        ok = tree.all_finite((after, likelihood))
+        after = tree.where(ok, after, state)
         info = TrackerInfo(jnp.where(ok, likelihood, 0.0), ok, jnp.sum(after.existence), crowded)
         return after, info
-
-    def extract(self, state: Tracks) -> Targets:
-        """The confirmed tracks."""
-        return extract_tracks(state, self.life)
 
 
 def _existence(

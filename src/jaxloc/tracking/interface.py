@@ -1,4 +1,4 @@
-"""What every tracker is: a filter of a whole scene, that says who is there."""
+"""Interface of multi-target trackers: a filter of all targets, with their extraction."""
 
 from abc import abstractmethod
 from typing import Any
@@ -10,13 +10,13 @@ from jaxloc.filters import Filter, Info
 
 
 class Targets(eqx.Module):
-    """Who is believed to be there, with room for a fixed number.
+    """Estimated targets, in a fixed number of slots.
 
     Attributes:
         means: states, stacked along a leading axis.
         covariances: each in the tangent space of its mean.
         probabilities: that the target exists (a PHD's weights may exceed one).
-        labels: the number of its track: the same target keeps it from step to step.
+        labels: number of the track of each target; it is kept from step to step.
         valid: which slots hold a target.
     """
 
@@ -28,13 +28,13 @@ class Targets(eqx.Module):
 
 
 class TrackerInfo(Info):
-    """What an update of any tracker says.
+    """Diagnostics of an update of any tracker.
 
     Attributes:
         log_likelihood: of the whole set of measurements given all earlier ones, up to what the tracker approximates.
         ok: whether the state can be used.
         count: expected number of targets.
-        crowded: how many components or tracks found no room.
+        crowded: number of components or tracks dropped for lack of room.
     """
 
     log_likelihood: Float[Array, ""]
@@ -44,11 +44,11 @@ class TrackerInfo(Info):
 
 
 class Tracker(Filter):
-    """A filter of many targets. Measurements of a step are a padded set, and `valid` says which there are.
+    """A filter of many targets; the measurements of a step are a padded set with a mask `valid`.
 
     `jaxloc.filters.run` drives it, ``run(tracker, state, controls, measurements, valid, keep=tracker.extract)``.
     """
 
     @abstractmethod
     def extract(self, state: Any) -> Targets:
-        """The targets that a state speaks of."""
+        """The estimated targets of a state."""

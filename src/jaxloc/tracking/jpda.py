@@ -1,4 +1,4 @@
-"""Joint probabilistic data association: as PDA, but no two tracks are measured as the same measurement."""
+"""Joint probabilistic data association (JPDA): as PDA, but two tracks never share a measurement."""
 
 from abc import abstractmethod
 from typing import Any
@@ -10,18 +10,16 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc._linalg import matmul
-from jaxloc.beliefs import Mixture
-from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
-from jaxloc.tracking.likelihood_ratio import examine
-from jaxloc.tracking.models.target import TargetModel
-from jaxloc.tracking.pda import Association, absorb, require_gaussian, scaled_weights
-from jaxloc.tracking.tracks import ExistenceLife, Life, Tracks, extract_tracks, open_tracks, predict_tracks
+from jaxloc.tracking.interface import Tracker, TrackerInfo
+from jaxloc.tracking.likelihood_ratio import compare_scan
+from jaxloc.tracking.pda import Association, require_gaussian, scaled_weights, update_tracks
+from jaxloc.tracking.tracks import Tracks, TrackTable
 
 _LARGEST_EXACT = 14  # bits of a set: 16384 sums a step
 
 
 class Marginals(eqx.Module):
-    """How the probabilities of pairs are found, given weights ``w_ij`` of pairs and ``w_i0`` of missing."""
+    """How association probabilities are computed from weights ``w_ij`` of pairs and ``w_i0`` of missed detections."""
 
     @abstractmethod
     def associate(self, log_odds: Float[Array, "k m"], log_missed: Float[Array, " k"]) -> Association:
@@ -34,9 +32,9 @@ class Marginals(eqx.Module):
 
 
 class Exact(Marginals):
-    """By a recursion over the longer side, that sums up for each set of the shorter side what can be made of it.
+    """Exact marginals, by a recursion over the longer side that sums over each subset of the shorter side.
 
-    Time and memory double with each member of the shorter side, which may have 14.
+    Time and memory double with each element of the shorter side, which may have 14.
 
     References:
         Fortmann, Bar-Shalom and Scheffe, "Sonar tracking of multiple targets using joint probabilistic data
@@ -69,12 +67,12 @@ class Exact(Marginals):
 
 
 class BeliefPropagation(Marginals):
-    """By messages between tracks and measurements, a fixed number of times; close to exact, at the cost of PDA.
+    """Loopy belief propagation between tracks and measurements: close to exact, at the cost of PDA.
 
-    The normalizer is that of Bethe.
+    The normalizer is the Bethe approximation.
 
     Args:
-        iterations: rounds of messages.
+        iterations: number of message rounds.
 
     References:
         Williams and Lau, "Approximate evaluation of marginal association probabilities with belief propagation", IEEE
@@ -114,18 +112,18 @@ class BeliefPropagation(Marginals):
         return Association(pairs, missed / totals, bethe)
 
 
-class JointProbabilisticDataAssociation(Tracker):
-    """All tracks together: a measurement is of one track at most (JIPDA).
+class JointProbabilisticDataAssociation(TrackTable, Tracker):
+    """Joint integrated PDA tracker: each measurement comes from at most one track (JIPDA).
 
     As in `ProbabilisticDataAssociation`, each track becomes the normal density with the moments of its mixture over
-    measurements, and its existence follows.
+    measurements, and its existence probability is updated.
 
     Args:
-        model: what targets do, and what is seen of them; with a filter of the Kalman family.
-        capacity: how many tracks there is room for, tentative ones included.
+        model: the target model, with a filter of the Kalman family.
+        capacity: number of slots for tracks, tentative ones included.
         gate: probability that a track's own measurement passes; None for no gate.
-        life: when tracks are confirmed and deleted.
-        marginals: how association probabilities are found, `BeliefPropagation` or `Exact`.
+        logic: when tracks are confirmed and deleted.
+        marginals: how association probabilities are computed, `BeliefPropagation` or `Exact`.
 
     Raises:
         TypeError: if the filter of the model is not of the Kalman family.
@@ -148,39 +146,22 @@ class JointProbabilisticDataAssociation(Tracker):
         2
     """
 
-    model: TargetModel
-    capacity: int = eqx.field(static=True, default=100)
-    gate: float | None = eqx.field(static=True, default=0.999)
-    life: Life = eqx.field(default_factory=ExistenceLife)
     marginals: Marginals = eqx.field(default_factory=BeliefPropagation)
 
     def __check_init__(self):
         require_gaussian(self.model, "JointProbabilisticDataAssociation")
-
-    def init(self, prior: Mixture | None) -> Tracks:
-        """Tracks of a prior, whose weights are probabilities; see `open_tracks`."""
-        return open_tracks(self.model, self.capacity, prior, self.life)
-
-    def predict(self, state: Tracks, control: Any, *, key: Key[Array, ""] | None = None) -> Tracks:
-        """Every track one step later."""
-        del key
-        return predict_tracks(self.model, state, control)
 
     def update(
         self, state: Tracks, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[Tracks, TrackerInfo]:
         """The tracks given a scan."""
         del key
-        scan = examine(self.model, state, measurement, valid, self.gate)
-        return absorb(state, scan, self.marginals.associate(scan.log_odds, scan.log_missed), self.life)
-
-    def extract(self, state: Tracks) -> Targets:
-        """The confirmed tracks."""
-        return extract_tracks(state, self.life)
+        scan = compare_scan(self.model, state, measurement, valid, self.gate)
+        return update_tracks(state, scan, self.marginals.associate(scan.log_odds, scan.log_missed), self.logic)
 
 
 def _log_matchings(table: Float[Array, "r c"]) -> Float[Array, ""]:
-    """Log of the sum over all one-to-one matchings of the products of their entries: columns are bits of a set."""
+    """Log of the sum over all one-to-one matchings of the products of their entries; subsets are bit masks."""
     columns = table.shape[1]
     sets = jnp.arange(1 << columns)
     bits = jnp.arange(columns)

@@ -1,32 +1,31 @@
-"""A scan beside the tracks: how much more each measurement speaks of a track than of clutter or of a newborn target."""
+"""Likelihood ratios of track-to-measurement pairs against clutter and new targets, for one scan."""
 
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _tree as tree
 from jaxloc.beliefs import Gaussian, chi2_quantile
 from jaxloc.filters import GaussianFilter, GaussianState, InteractingFilters
-from jaxloc.filters.kalman import finite_or_zero
-from jaxloc.tracking.gating import Comparison, compare, corrected, count_valid
+from jaxloc.tracking.gating import Comparison, compare, corrected, usable_measurements
 from jaxloc.tracking.models.birth import StaticBirth
 from jaxloc.tracking.models.target import TargetModel
 from jaxloc.tracking.tracks import Tracks
 
-_RAREST = -200.0  # log intensity of false measurements where there can be none
+_RAREST = -200.0  # log intensity of false measurements where it would be zero
 
 
-class Newborn(eqx.Module):
-    """What each measurement would be as the first one of a new target.
+class NewTargets(eqx.Module):
+    """The new targets that measurements may be the first of.
 
     Attributes:
         states: of the new targets, stacked.
-        log_intensity: of first measurements, with the probability that they are made.
-        expected: number of first measurements in a scan.
+        log_intensity: of first measurements, detection included.
+        expected: expected number of first measurements in a scan.
     """
 
     states: Any
@@ -35,131 +34,125 @@ class Newborn(eqx.Module):
 
 
 class Scan(eqx.Module):
-    """A padded set of measurements beside predicted tracks.
+    """A padded set of measurements compared with predicted tracks.
 
     The log of the sum over all joint associations is
 
     ``base + log sum_a prod_i (exp log_odds[i, a_i] or, where i has none, exp log_missed[i])``.
 
     Attributes:
-        measurements: with finite numbers everywhere.
-        there: which of them there are.
-        comparison: of Gaussian tracks with them; None for tracks with modes.
+        measurements: finite everywhere.
+        valid: mask of the measurements.
+        comparison: of Gaussian tracks with them; None for tracks of `InteractingFilters`.
         detection: p_D of each track.
         log_missed: ``log (1 - r p_D)``.
         log_odds: ``log (r p_D N(z; ...) / (kappa + b))``; minus infinity outside the gate.
-        newborn: the measurements as first ones.
-        share: of newborn targets in the false measurements, ``b / (kappa + b)``.
-        base: log likelihood of the scan if no track were measured.
+        newborn: new targets of the measurements.
+        share: probability that an unassociated measurement is of a new target, ``b / (kappa + b)``.
+        base: log likelihood of the scan if no track were detected.
     """
 
     measurements: Any
-    there: Bool[Array, " m"]
+    valid: Bool[Array, " m"]
     comparison: Comparison | None
     detection: Float[Array, " k"]
     log_missed: Float[Array, " k"]
     log_odds: Float[Array, "k m"]
-    newborn: Newborn
+    newborn: NewTargets
     share: Float[Array, " m"]
     base: Float[Array, ""]
 
 
-def examine(
+def compare_scan(
     model: TargetModel, tracks: Tracks, measurements: Any, valid: Bool[Array, " m"], gate: float | None
 ) -> Scan:
-    """Every predicted track beside every measurement.
+    """Compares every predicted track with every measurement.
 
     Args:
-        model: the assumptions.
+        model: the target model.
         tracks: as predicted.
         measurements: stacked.
-        valid: which of them there are.
+        valid: mask of the measurements.
         gate: probability that a track's own measurement passes; None for no gate.
     """
-    there = count_valid(measurements, valid)
-    measurements = finite_or_zero(measurements)
-    likelihood, comparison = _look(model.filter, tracks.states, measurements, there, gate)
+    present = usable_measurements(measurements, valid)
+    measurements = tree.finite_or_zero(measurements)
+    likelihood, comparison = _likelihoods(model.filter, tracks.states, measurements, present, gate)
     detection = _detection(model, tracks.means(), tracks.existence)
-    newborn = begin(model, tracks, measurements, there)
+    newborn = initiate(model, tracks, measurements, present)
     clutter = jax.vmap(model.clutter.log_intensity)(measurements)
     false = jnp.maximum(jnp.logaddexp(clutter, newborn.log_intensity), _RAREST)
     seen = tracks.existence * detection
     inside = jnp.isfinite(likelihood) & (seen > 0.0)[:, None]
     log_seen = jnp.log(jnp.where(seen > 0.0, seen, 1.0))
     odds = log_seen[:, None] + jnp.where(inside, likelihood, 0.0) - false[None, :]
-    # A certain target that is surely measured may still be missed, by rounding: no division by zero.
+    # Bounded by rounding, for tracks and detections of probability one.
     missed = jnp.log(jnp.maximum(1.0 - seen, float(jnp.finfo(seen.dtype).eps)))
-    share = jnp.where(there, jnp.exp(jnp.minimum(newborn.log_intensity - false, 0.0)), 0.0)
-    base = jnp.sum(jnp.where(there, false, 0.0)) - model.clutter.rate - newborn.expected
+    share = jnp.where(present, jnp.exp(jnp.minimum(newborn.log_intensity - false, 0.0)), 0.0)
+    base = jnp.sum(jnp.where(present, false, 0.0)) - model.clutter.rate - newborn.expected
     return Scan(
-        measurements, there, comparison, detection, missed, jnp.where(inside, odds, -jnp.inf), newborn, share, base
+        measurements, present, comparison, detection, missed, jnp.where(inside, odds, -jnp.inf), newborn, share, base
     )
 
 
-def begin(model: TargetModel, tracks: Tracks, measurements: Any, there: Bool[Array, " m"]) -> Newborn:
-    """The targets that measurements would be the first of.
+def initiate(model: TargetModel, tracks: Tracks, measurements: Any, present: Bool[Array, " m"]) -> NewTargets:
+    """The new targets of measurements.
 
-    Where births are a mixture, the component that explains a measurement best is corrected by it.
+    Where births are a mixture, the most likely component of each measurement is updated by it.
     """
-    num = there.shape[0]
+    num = present.shape[0]
     first = jax.tree.map(lambda leaf: leaf[0], measurements)
     if isinstance(model.birth, StaticBirth):
-        return _from_mixture(model, measurements, there)
+        return _from_mixture(model, measurements, present)
     if model.birth.log_intensity(first) is None:
         states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[0], (num, *leaf.shape[1:])), tracks.states)
         nothing = jnp.zeros((), tracks.existence.dtype)
-        return Newborn(states, jnp.full((num,), -jnp.inf, nothing.dtype), nothing)
+        return NewTargets(states, jnp.full((num,), -jnp.inf, nothing.dtype), nothing)
     intensity = jax.vmap(model.birth.log_intensity)(measurements)
     states = jax.vmap(lambda z: model.filter.init(model.birth.seed(z)))(measurements)
-    return Newborn(states, jnp.where(there, intensity, -jnp.inf), model.birth.rate)
+    return NewTargets(states, jnp.where(present, intensity, -jnp.inf), model.birth.rate)
 
 
-def _from_mixture(model: TargetModel, measurements: Any, there: Bool[Array, " m"]) -> Newborn:
+def _from_mixture(model: TargetModel, measurements: Any, present: Bool[Array, " m"]) -> NewTargets:
     mixture = model.birth.intensity
     states = jax.vmap(lambda mean, covariance: model.filter.init(Gaussian(mean, covariance)))(
         mixture.means, mixture.covariances
     )
-    likelihood, comparison = _look(model.filter, states, measurements, there, None)
+    likelihood, comparison = _likelihoods(model.filter, states, measurements, present, None)
     expected = mixture.weights * _detection(model, mixture.means, mixture.weights)
     possible = jnp.isfinite(likelihood) & (expected > 0.0)[:, None]
     scale = jnp.log(jnp.where(expected > 0.0, expected, 1.0))
     terms = jnp.where(possible, scale[:, None] + jnp.where(possible, likelihood, 0.0), -1e30)
     intensity = jnp.where(jnp.any(possible, axis=0), logsumexp(terms, axis=0), -jnp.inf)
     best = jnp.argmax(terms, axis=0)
-    scan = _correct(model.filter, states, comparison, measurements, there, best, jnp.arange(there.shape[0]))
-    return Newborn(scan, intensity, jnp.sum(expected))
+    scan = _correct(model.filter, states, comparison, measurements, present, best, jnp.arange(present.shape[0]))
+    return NewTargets(scan, intensity, jnp.sum(expected))
 
 
 def correct_tracks(
     model: TargetModel, tracks: Tracks, scan: Scan, rows: Int[Array, " n"], columns: Int[Array, " n"]
 ) -> Any:
-    """The states of some tracks given a measurement each.
+    """Posterior states of some tracks given a measurement each.
 
     Args:
-        model: the assumptions.
-        tracks: as they were examined.
-        scan: what `examine` found.
-        rows: places of the tracks.
-        columns: places of the measurements.
+        model: the target model.
+        tracks: as given to `compare_scan`.
+        scan: result of `compare_scan`.
+        rows: indices of the tracks.
+        columns: indices of the measurements.
     """
-    return _correct(model.filter, tracks.states, scan.comparison, scan.measurements, scan.there, rows, columns)
-
-
-def whole(state: Any, likelihood: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether all numbers of a state and its likelihood are finite."""
-    leaves = [leaf for leaf in jax.tree.leaves((state, likelihood)) if eqx.is_inexact_array(leaf)]
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(lax.stop_gradient(leaf))) for leaf in leaves]))
+    return _correct(model.filter, tracks.states, scan.comparison, scan.measurements, scan.valid, rows, columns)
 
 
 def _detection(model: TargetModel, means: Any, like: Float[Array, " k"]) -> Float[Array, " k"]:
     return jax.vmap(model.detection.probability)(means).astype(like.dtype)
 
 
-def _look(
-    filt: Any, states: Any, measurements: Any, there: Bool[Array, " m"], gate: float | None
+def _likelihoods(
+    filt: Any, states: Any, measurements: Any, present: Bool[Array, " m"], gate: float | None
 ) -> tuple[Float[Array, "k m"], Comparison | None]:
     if isinstance(filt, GaussianFilter):
-        comparison = compare(filt, states.mean, states.covariance_sqrt, measurements, there, gate)
+        comparison = compare(filt, states.mean, states.covariance_sqrt, measurements, present, gate)
         return comparison.log_likelihood, comparison
     if not isinstance(filt, InteractingFilters):
         raise TypeError(
@@ -170,9 +163,9 @@ def _look(
         _, info = filt.update(state, z, here)
         return info.log_likelihood, jnp.min(info.modes.nis), info.modes.innovation
 
-    each = jax.vmap(lambda state: jax.vmap(lambda z, here: pair(state, z, here))(measurements, there))
+    each = jax.vmap(lambda state: jax.vmap(lambda z, here: pair(state, z, here))(measurements, present))
     likelihood, nis, innovations = each(states)
-    inside = jnp.broadcast_to(there[None, :], nis.shape)
+    inside = jnp.broadcast_to(present[None, :], nis.shape)
     if gate is not None:
         with jax.ensure_compile_time_eval():
             bound = float(chi2_quantile(gate, float(innovations.shape[-1])))
@@ -185,7 +178,7 @@ def _correct(
     states: Any,
     comparison: Comparison | None,
     measurements: Any,
-    there: Bool[Array, " m"],
+    present: Bool[Array, " m"],
     rows: Int[Array, " n"],
     columns: Int[Array, " n"],
 ) -> Any:
@@ -198,6 +191,6 @@ def _correct(
 
     def one(i, j):
         state, z = jax.tree.map(lambda leaf: leaf[i], states), jax.tree.map(lambda leaf: leaf[j], measurements)
-        return filt.update(state, z, there[j])[0]
+        return filt.update(state, z, present[j])[0]
 
     return jax.vmap(one)(rows, columns)

@@ -1,8 +1,8 @@
-"""Multiple hypothesis tracking: associations are decided scans later, when what followed speaks for one of them.
+"""Track-oriented multiple hypothesis tracking (MHT): associations are decided some scans later.
 
-Track-oriented: single-target hypotheses (leaves of track trees) are kept once, and global hypotheses are lists of
-them, one of a tree at most. Whether a new track is clutter is left to its existence probability, which saves a branch
-for each measurement. From all global hypotheses together, the best children are found track by track.
+Single-target hypotheses (leaves of track trees) are stored once, and global hypotheses are lists of them, at most one
+of a tree. Whether a new track is clutter is left to its existence probability, which saves a branch for each
+measurement. The best children of all global hypotheses are found by one search, track by track.
 """
 
 from typing import Any
@@ -14,29 +14,29 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Mixture
 from jaxloc.filters import FilterState
-from jaxloc.filters.kalman import select
 from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
-from jaxloc.tracking.likelihood_ratio import Scan, correct_tracks, examine, whole
+from jaxloc.tracking.likelihood_ratio import Scan, compare_scan, correct_tracks
 from jaxloc.tracking.models.target import TargetModel
-from jaxloc.tracking.tracks import NO_LABEL, ExistenceLife, Tracks, age_tracks, miss, open_tracks, predict_tracks
+from jaxloc.tracking.tracks import NO_LABEL, ExistenceLogic, Tracks, age_tracks, miss, open_tracks, predict_tracks
 
-_NEVER = -1e30  # log weight of what cannot be
-_LIGHTEST = -14.0  # log weight beside the best hypothesis, below which one is dropped
+_NEVER = -1e30  # log weight of impossible hypotheses
+_LIGHTEST = -14.0  # log weight relative to the best hypothesis, below which one is dropped
 _UNBORN = -2  # in paths: before the first measurement; -1 is a missed detection
 
 
 class Hypotheses(FilterState):
-    """What the next step of a multiple hypothesis tracker needs.
+    """State of the multiple hypothesis tracker.
 
     Attributes:
-        leaves: single-target hypotheses; those with one label are of one tree. Existence is given the leaf.
-        paths: the measurement that each leaf took in the last scans, the last one first; -1 for none, -2 before birth.
+        leaves: single-target hypotheses; those of one tree share a label. Existence is conditional on the leaf.
+        paths: the measurement of each leaf in the last scans, the last one first; -1 for missed, -2 before birth.
         members: leaves of each global hypothesis, -1 where there are fewer.
         log_weights: of the global hypotheses.
-        step: how many predictions led here.
+        step: number of predictions so far.
     """
 
     leaves: Tracks
@@ -46,43 +46,43 @@ class Hypotheses(FilterState):
     step: Int[Array, ""]
 
     def membership(self) -> Bool[Array, "h t"]:
-        """Which leaves each global hypothesis has."""
+        """Mask of the leaves of each global hypothesis."""
         leaf = jnp.arange(self.leaves.capacity, dtype=self.members.dtype)
         return jnp.any(self.members[:, :, None] == leaf[None, None, :], axis=1)
 
     def shares(self) -> Float[Array, " t"]:
-        """Probability of each leaf that its target exists and took this path."""
+        """Probability that the target of each leaf exists and took its path."""
         weights = jnp.exp(self.log_weights)
         return matmul(weights, self.membership().astype(weights.dtype)) * self.leaves.existence
 
     def existence(self) -> Float[Array, " t"]:
-        """Probability that the target of each leaf's tree exists, over all global hypotheses."""
+        """Probability that the target of each leaf's tree exists, summed over global hypotheses."""
         same = self.leaves.labels[:, None] == self.leaves.labels[None, :]
         shares = self.shares()
         return jnp.minimum(matmul(same.astype(shares.dtype), shares), 1.0)
 
 
 class MultipleHypothesisTracker(Tracker):
-    """Several explanations of all scans at once, the best of which are kept; answers are those of the best one.
+    """Keeps the most probable global association hypotheses; estimates are those of the best one.
 
-    Children are found by a beam search: tracks choose a measurement or none in turn, and as many partial explanations
-    go on as the beam is wide, those that could still become the best. The result is exact while no more than that are
-    possible. Explanations that contradict the best one more than `scans` back are dropped.
+    Children are found by a beam search: tracks choose a measurement or a missed detection in turn, and the partial
+    hypotheses of the largest upper bounds are kept, as many as the beam is wide. The result is exact while no more are
+    possible. Hypotheses that contradict the best one more than `scans` scans back are dropped (N-scan pruning).
 
-    Labels are unique, but not consecutive: a tree has that of its first measurement.
+    Labels are unique, but not consecutive: a tree has the label of its first measurement.
 
     Args:
-        model: what targets do, and what is seen of them; its filter may be an `InteractingFilters`.
-        leaves: how many single-target hypotheses there is room for.
-        tracks: how many of them a global hypothesis may have.
-        hypotheses: how many global hypotheses are kept.
-        beam: how many partial ones are searched, at least as many.
-        scans: N, decisions are final after so many scans.
+        model: the target model; its filter may be an `InteractingFilters`.
+        leaves: capacity for single-target hypotheses.
+        tracks: largest number of tracks in a global hypothesis.
+        hypotheses: number of global hypotheses kept.
+        beam: number of partial hypotheses in the search, at least as many.
+        scans: N of the N-scan pruning: associations are final after N scans.
         gate: probability that a track's own measurement passes; None for no gate.
-        life: when tracks are confirmed and deleted.
+        logic: when tracks are confirmed and deleted.
 
     Raises:
-        ValueError: if the beam is narrower than the number of hypotheses, or there are no scans.
+        ValueError: if the beam is narrower than the number of hypotheses, `tracks` exceeds `leaves`, or scans are none.
 
     References:
         Reid, "An algorithm for tracking multiple targets", IEEE TAC 1979; Kurien 1990; Brekke and Chitre,
@@ -111,7 +111,7 @@ class MultipleHypothesisTracker(Tracker):
     beam: int = eqx.field(static=True, default=64)
     scans: int = eqx.field(static=True, default=5)
     gate: float | None = eqx.field(static=True, default=0.999)
-    life: ExistenceLife = eqx.field(default_factory=ExistenceLife)
+    logic: ExistenceLogic = eqx.field(default_factory=ExistenceLogic)
 
     def __check_init__(self):
         if self.beam < self.hypotheses or self.scans < 1 or self.tracks > self.leaves:
@@ -121,10 +121,10 @@ class MultipleHypothesisTracker(Tracker):
             )
 
     def init(self, prior: Mixture | None) -> Hypotheses:
-        """One hypothesis of a prior, whose weights are probabilities; see `open_tracks`."""
+        """One hypothesis of a prior, whose weights are probabilities of existence; see `open_tracks`."""
         if prior is not None and prior.capacity > self.tracks:
             raise ValueError(f"The prior has {prior.capacity} components, but a hypothesis has {self.tracks} tracks.")
-        leaves = open_tracks(self.model, self.leaves, prior, self.life)
+        leaves = open_tracks(self.model, self.leaves, prior, self.logic)
         first = jnp.where(leaves.valid[: self.tracks], jnp.arange(self.tracks, dtype=jnp.int32), -1)
         members = jnp.full((self.hypotheses, self.tracks), -1, first.dtype).at[0].set(first)
         weights = jnp.full((self.hypotheses,), _NEVER, leaves.existence.dtype).at[0].set(0.0)
@@ -132,7 +132,7 @@ class MultipleHypothesisTracker(Tracker):
         return Hypotheses(leaves, paths, members, weights, leaves.step)
 
     def predict(self, state: Hypotheses, control: Any, *, key: Key[Array, ""] | None = None) -> Hypotheses:
-        """Every leaf one step later."""
+        """Every leaf predicted one step ahead."""
         del key
         leaves = predict_tracks(self.model, state.leaves, control)
         return Hypotheses(leaves, state.paths, state.members, state.log_weights, leaves.step)
@@ -140,16 +140,16 @@ class MultipleHypothesisTracker(Tracker):
     def update(
         self, state: Hypotheses, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[Hypotheses, TrackerInfo]:
-        """The hypotheses given a scan; the likelihood counts the children found."""
+        """The hypotheses given a scan; the likelihood is summed over the children found."""
         del key
-        scan = examine(self.model, state.leaves, measurement, valid, self.gate)
+        scan = compare_scan(self.model, state.leaves, measurement, valid, self.gate)
         children = search(scan, state, self.beam)
         likelihood = scan.base + logsumexp(children.log_weights) - logsumexp(state.log_weights)
         children = jax.tree.map(lambda leaf: leaf[: self.hypotheses], children)
-        after, crowded = _regrow(self, state, scan, children)
-        after = _settle(after, self.life)
-        ok = whole(after, likelihood)
-        after = select(ok, after, state)
+        after, crowded = _expand(self, state, scan, children)
+        after = _resolve(after, self.logic)
+        ok = tree.all_finite((after, likelihood))
+        after = tree.where(ok, after, state)
         return after, TrackerInfo(jnp.where(ok, likelihood, 0.0), ok, jnp.sum(after.shares()), crowded)
 
     def extract(self, state: Hypotheses) -> Targets:
@@ -160,16 +160,16 @@ class MultipleHypothesisTracker(Tracker):
         labels = jnp.where(members >= 0, chosen.labels, NO_LABEL)
         chosen = eqx.tree_at(lambda t: (t.existence, t.labels), chosen, (existence, labels))
         found = chosen.densities()
-        return Targets(found.mean, found.covariance, existence, chosen.labels, self.life.shows(chosen))
+        return Targets(found.mean, found.covariance, existence, chosen.labels, self.logic.reports(chosen))
 
 
 class Children(eqx.Module):
     """Global hypotheses after a scan, best first.
 
     Attributes:
-        parents: the hypothesis that each comes from.
-        choices: of each of its members: 0 for missed, else one more than the place of a measurement.
-        used: measurements that its members took.
+        parents: hypothesis before the scan.
+        choices: for each member, 0 for missed, else one more than the index of its measurement.
+        used: mask of the assigned measurements.
         log_weights: not normalized.
     """
 
@@ -180,19 +180,19 @@ class Children(eqx.Module):
 
 
 def search(scan: Scan, state: Hypotheses, beam: int) -> Children:
-    """The best associations of a scan with all hypotheses at once.
+    """Beam search for the best associations of a scan with all global hypotheses.
 
     Args:
-        scan: beside the leaves.
+        scan: compared with the leaves.
         state: hypotheses before the scan.
-        beam: how many partial associations are carried on. They are ranked by what they would be worth if the rest of
-            their tracks could choose freely.
+        beam: number of partial associations kept. They are ranked by an upper bound, the weight if the remaining
+            tracks could choose without conflicts.
     """
     (num, size), (count, measured) = state.members.shape, scan.log_odds.shape
     pairs = jnp.where(jnp.isfinite(scan.log_odds), scan.log_odds, _NEVER)
     table = jnp.concatenate([scan.log_missed[:, None], pairs], axis=1)
-    nobody = jnp.full((1, measured + 1), _NEVER, table.dtype).at[0, 0].set(0.0)
-    table = jnp.concatenate([table, nobody])
+    none = jnp.full((1, measured + 1), _NEVER, table.dtype).at[0, 0].set(0.0)
+    table = jnp.concatenate([table, none])
     members = jnp.where(state.members < 0, count, state.members)
     best = jnp.max(table, axis=1)[members]
     later = jnp.cumsum(best[:, ::-1], axis=1)[:, ::-1] - best
@@ -200,32 +200,32 @@ def search(scan: Scan, state: Hypotheses, beam: int) -> Children:
     def choose(children, column):
         options = table[members[children.parents, column]]
         blocked = jnp.concatenate([jnp.zeros((beam, 1), bool), children.used], axis=1)
-        worth = children.log_weights[:, None] + jnp.where(blocked, _NEVER, options)
-        hope = worth + later[children.parents, column][:, None]
-        _, places = lax.top_k(lax.stop_gradient(hope.reshape(-1)), beam)
+        weights = children.log_weights[:, None] + jnp.where(blocked, _NEVER, options)
+        bounds = weights + later[children.parents, column][:, None]
+        _, places = lax.top_k(lax.stop_gradient(bounds.reshape(-1)), beam)
         rows, choice = places // (measured + 1), places % (measured + 1)
         used = children.used[rows] | (choice[:, None] == 1 + jnp.arange(measured, dtype=choice.dtype)[None, :])
         choices = children.choices[rows].at[:, column].set(choice)
-        return Children(children.parents[rows], choices, used, worth.reshape(-1)[places]), None
+        return Children(children.parents[rows], choices, used, weights.reshape(-1)[places]), None
 
     fill = beam - num
-    start = Children(
+    initial = Children(
         jnp.concatenate([jnp.arange(num, dtype=jnp.int32), jnp.zeros(fill, jnp.int32)]),
         jnp.zeros((beam, size), jnp.int32),
         jnp.zeros((beam, measured), bool),
         jnp.concatenate([state.log_weights, jnp.full((fill,), _NEVER, table.dtype)]),
     )
-    children, _ = lax.scan(choose, start, jnp.arange(size))
+    children, _ = lax.scan(choose, initial, jnp.arange(size))
     log_weights, order = lax.top_k(jnp.maximum(children.log_weights, _NEVER), beam)
     return Children(children.parents[order], children.choices[order], children.used[order], log_weights)
 
 
-def _regrow(
+def _expand(
     tracker: MultipleHypothesisTracker, state: Hypotheses, scan: Scan, children: Children
 ) -> tuple[Hypotheses, Int[Array, ""]]:
-    """The leaves that children need, each once, and the children as lists of them."""
+    """The leaves of the children, without duplicates, and the children as lists of them."""
     (count, measured), width = scan.log_odds.shape, scan.log_odds.shape[1] + 1
-    # A leaf and its choice make a number; newborn tracks follow after these.
+    # A leaf and its choice are coded as one number; new tracks follow after these.
     missed = miss(state.leaves.existence, scan.detection)
     hit = jnp.broadcast_to(state.leaves.valid[:, None], (count, measured)).astype(missed.dtype)
     existence = jnp.concatenate([jnp.concatenate([missed[:, None], hit], axis=1).reshape(-1), scan.share])
@@ -233,16 +233,16 @@ def _regrow(
     grown = jnp.where(members >= 0, jnp.maximum(members, 0) * width + children.choices, -1)
     born = jnp.where(children.used, -1, count * width + jnp.arange(measured, dtype=jnp.int32)[None, :])
     numbers = jnp.concatenate([grown, born], axis=1)
-    alive = (numbers >= 0) & (existence[numbers] >= tracker.life.delete.astype(existence.dtype))
-    alive = alive & (children.log_weights > children.log_weights[0] + _LIGHTEST)[:, None]
+    kept_members = (numbers >= 0) & (existence[numbers] >= tracker.logic.delete.astype(existence.dtype))
+    kept_members = kept_members & (children.log_weights > children.log_weights[0] + _LIGHTEST)[:, None]
 
-    shares = jnp.where(alive, jax.nn.softmax(children.log_weights)[:, None] * existence[numbers], 0.0)
-    safe = jnp.where(alive, numbers, 0)
+    shares = jnp.where(kept_members, jax.nn.softmax(children.log_weights)[:, None] * existence[numbers], 0.0)
+    safe = jnp.where(kept_members, numbers, 0)
     shares = jnp.zeros_like(existence).at[safe.reshape(-1)].add(shares.reshape(-1))
     kept, chosen = lax.top_k(lax.stop_gradient(shares), min(tracker.leaves, shares.shape[0]))
     there, slots = kept > 0.0, jnp.arange(chosen.shape[0], dtype=jnp.int32)
     places = jnp.full(shares.shape, -1, jnp.int32).at[chosen].set(jnp.where(there, slots, -1))
-    places = jnp.where(alive, places[safe], -1)
+    places = jnp.where(kept_members, places[safe], -1)
     strength = jnp.where(places >= 0, existence[safe], -1.0)
     _, order = lax.top_k(lax.stop_gradient(strength), members.shape[1])
     members = jnp.take_along_axis(places, order, axis=1)
@@ -258,34 +258,34 @@ def _regrow(
 def _leaves(
     model: TargetModel, state: Hypotheses, scan: Scan, numbers: Int[Array, " t"], existence: Float[Array, " t"]
 ) -> tuple[Tracks, Int[Array, "t n"]]:
-    """Leaves after a scan, by the numbers of leaf and choice, with their paths."""
+    """Leaves after a scan, by the codes of leaf and choice, with their paths."""
     (count, measured), width = scan.log_odds.shape, scan.log_odds.shape[1] + 1
     newborn = numbers >= count * width
     rows = jnp.where(newborn, 0, numbers // width)
     column = jnp.where(newborn, numbers - count * width, numbers % width - 1)
     hit, safe = column >= 0, jnp.maximum(column, 0)
     old = state.leaves.take(rows)
-    states = jax.vmap(select)(hit, correct_tracks(model, state.leaves, scan, rows, safe), old.states)
+    states = jax.vmap(tree.where)(hit, correct_tracks(model, state.leaves, scan, rows, safe), old.states)
     born = jax.tree.map(lambda leaf: leaf[safe], scan.newborn.states)
-    states = jax.vmap(select)(newborn, born, states)
+    states = jax.vmap(tree.where)(newborn, born, states)
     aged = age_tracks(eqx.tree_at(lambda t: t.existence, old, existence), states, existence, hit)
-    labels = jnp.where(newborn, old.given + safe, aged.labels)
+    labels = jnp.where(newborn, old.num_labels + safe, aged.labels)
     leaves = Tracks(
         states,
         existence,
         jnp.where(existence > 0.0, labels, NO_LABEL).astype(jnp.int32),
         aged.confirmed & ~newborn,
-        jnp.where(newborn, 1, aged.recent),
+        jnp.where(newborn, 1, aged.history),
         jnp.where(newborn, 1, aged.age),
-        old.given + measured,
+        old.num_labels + measured,
         old.step,
     )
     before = jnp.where(newborn[:, None], _UNBORN, state.paths[rows])
     return leaves, jnp.concatenate([column[:, None].astype(jnp.int32), before[:, :-1]], axis=1)
 
 
-def _settle(state: Hypotheses, life: ExistenceLife) -> Hypotheses:
-    """Makes old decisions final, joins hypotheses that became the same, and confirms tracks."""
+def _resolve(state: Hypotheses, logic: ExistenceLogic) -> Hypotheses:
+    """N-scan pruning, merging of identical hypotheses, and confirmation of tracks."""
     leaves, member = state.leaves, state.membership()
     best = jnp.argmax(state.log_weights)
     same = (leaves.labels[:, None] == leaves.labels[None, :]) & leaves.valid[:, None] & leaves.valid[None, :]
@@ -299,8 +299,8 @@ def _settle(state: Hypotheses, life: ExistenceLife) -> Hypotheses:
     total = logsumexp(jnp.where(equal, weights[None, :], _NEVER), axis=1)
     weights = jnp.where(first & (weights > _NEVER), total, _NEVER)
     weights = jnp.maximum(weights - logsumexp(weights), _NEVER)
-    settled = Hypotheses(leaves, state.paths, state.members, weights, state.step)
-    believed = eqx.tree_at(lambda t: t.existence, leaves, settled.existence())
+    resolved = Hypotheses(leaves, state.paths, state.members, weights, state.step)
+    updated = eqx.tree_at(lambda t: t.existence, leaves, resolved.existence())
     known = jnp.any(same & leaves.confirmed[None, :], axis=1)
-    confirmed = leaves.valid & (known | life.confirms(believed))
-    return eqx.tree_at(lambda h: h.leaves.confirmed, settled, confirmed)
+    confirmed = leaves.valid & (known | logic.confirms(updated))
+    return eqx.tree_at(lambda h: h.leaves.confirmed, resolved, confirmed)

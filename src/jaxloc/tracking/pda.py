@@ -1,4 +1,4 @@
-"""Probabilistic data association: each track is updated by all measurements around it, weighed by what is probable."""
+"""Probabilistic data association (PDA): each track is updated by all gated measurements, weighted by probability."""
 
 from typing import Any
 
@@ -7,33 +7,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from jaxloc.beliefs import Mixture
+from jaxloc import _tree as tree
 from jaxloc.beliefs.square_root import cholesky, product, triangularize
 from jaxloc.filters import GaussianFilter, GaussianState
-from jaxloc.filters.kalman import recenter, select
+from jaxloc.filters.kalman import retract_root
 from jaxloc.tracking.gating import Comparison
-from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
-from jaxloc.tracking.likelihood_ratio import Scan, examine, whole
+from jaxloc.tracking.interface import Tracker, TrackerInfo
+from jaxloc.tracking.likelihood_ratio import Scan, compare_scan
 from jaxloc.tracking.models.target import TargetModel
-from jaxloc.tracking.tracks import (
-    ExistenceLife,
-    Life,
-    Tracks,
-    age_tracks,
-    extract_tracks,
-    miss,
-    open_tracks,
-    predict_tracks,
-    renew,
-)
+from jaxloc.tracking.tracks import TrackLogic, Tracks, TrackTable, age_tracks, manage_tracks, miss
 
 
 class Association(eqx.Module):
-    """How probable it is that each track was measured as each measurement.
+    """Association probabilities of tracks and measurements.
 
     Attributes:
-        pairs: beta, of track (row) and measurement (column).
-        missed: that a track has no measurement: the rest of its row.
+        pairs: beta, probability that a track (row) gave a measurement (column).
+        missed: probability that a track has no measurement: the rest of its row.
         log_normalizer: log of the sum over all joint associations of their weights.
     """
 
@@ -42,18 +32,18 @@ class Association(eqx.Module):
     log_normalizer: Float[Array, ""]
 
 
-class ProbabilisticDataAssociation(Tracker):
-    """Each track for itself: whatever is around it is its own measurement or clutter, never another track's (IPDA).
+class ProbabilisticDataAssociation(TrackTable, Tracker):
+    """Integrated PDA tracker: tracks are independent, gated measurements are the track's own or clutter (IPDA).
 
-    The state of a track becomes the normal density with the moments of its mixture over measurements; existence
-    follows. Tracks that come close share measurements: they may fall together, and several tracks of one target do not
-    give way to each other. `JointProbabilisticDataAssociation` costs little more.
+    The state of a track becomes the normal density with the moments of its mixture over measurements, and its existence
+    probability is updated. Close tracks share measurements: they may coalesce, and duplicate tracks of one target
+    persist. `JointProbabilisticDataAssociation` costs little more.
 
     Args:
-        model: what targets do, and what is seen of them; with a filter of the Kalman family.
-        capacity: how many tracks there is room for, tentative ones included.
+        model: the target model, with a filter of the Kalman family.
+        capacity: number of slots for tracks, tentative ones included.
         gate: probability that a track's own measurement passes; None for no gate.
-        life: when tracks are confirmed and deleted.
+        logic: when tracks are confirmed and deleted.
 
     Raises:
         TypeError: if the filter of the model is not of the Kalman family.
@@ -76,34 +66,16 @@ class ProbabilisticDataAssociation(Tracker):
         1
     """
 
-    model: TargetModel
-    capacity: int = eqx.field(static=True, default=100)
-    gate: float | None = eqx.field(static=True, default=0.999)
-    life: Life = eqx.field(default_factory=ExistenceLife)
-
     def __check_init__(self):
         require_gaussian(self.model, "ProbabilisticDataAssociation")
-
-    def init(self, prior: Mixture | None) -> Tracks:
-        """Tracks of a prior, whose weights are probabilities; see `open_tracks`."""
-        return open_tracks(self.model, self.capacity, prior, self.life)
-
-    def predict(self, state: Tracks, control: Any, *, key: Key[Array, ""] | None = None) -> Tracks:
-        """Every track one step later."""
-        del key
-        return predict_tracks(self.model, state, control)
 
     def update(
         self, state: Tracks, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[Tracks, TrackerInfo]:
         """The tracks given a scan."""
         del key
-        scan = examine(self.model, state, measurement, valid, self.gate)
-        return absorb(state, scan, associate_alone(scan.log_odds, scan.log_missed), self.life)
-
-    def extract(self, state: Tracks) -> Targets:
-        """The confirmed tracks."""
-        return extract_tracks(state, self.life)
+        scan = compare_scan(self.model, state, measurement, valid, self.gate)
+        return update_tracks(state, scan, associate_alone(scan.log_odds, scan.log_missed), self.logic)
 
 
 def require_gaussian(model: TargetModel, name: str) -> None:
@@ -116,7 +88,7 @@ def require_gaussian(model: TargetModel, name: str) -> None:
 
 
 def associate_alone(log_odds: Float[Array, "k m"], log_missed: Float[Array, " k"]) -> Association:
-    """Association probabilities of each track as if there were no other: ``beta_ij = w_ij / (w_i0 + sum_l w_il)``.
+    """Association probabilities of each track as if it were the only one: ``beta_ij = w_ij / (w_i0 + sum_l w_il)``.
 
     Args:
         log_odds: ``log w_ij`` of the pairs; minus infinity where they are impossible.
@@ -137,39 +109,39 @@ def associate_alone(log_odds: Float[Array, "k m"], log_missed: Float[Array, " k"
 def scaled_weights(
     log_odds: Float[Array, "k m"], log_missed: Float[Array, " k"]
 ) -> tuple[Float[Array, "k m"], Float[Array, " k"], Float[Array, " k"]]:
-    """Weights of pairs and of missing, divided by the largest of the track, and the logarithm of that."""
+    """Weights of pairs and of missed detections over the largest of each track, and the log of the largest."""
     possible = jnp.isfinite(log_odds)
     safe = jnp.where(possible, log_odds, 0.0)
     largest = jnp.max(jnp.where(possible, safe, -jnp.inf), axis=1, initial=-jnp.inf)
     scales = jax.lax.stop_gradient(jnp.maximum(largest, log_missed))
     weights = jnp.where(possible, jnp.exp(jnp.where(possible, safe - scales[:, None], 0.0)), 0.0)
-    # Tracks that agree on a measurement by far must leave it to one: no missed detection is impossible.
+    # Several tracks may all favor one measurement by far: a missed detection must stay possible.
     least = float(jnp.finfo(weights.dtype).eps) ** 2
     return weights, jnp.maximum(jnp.exp(log_missed - scales), least), scales
 
 
-def absorb(state: Tracks, scan: Scan, found: Association, life: Life) -> tuple[Tracks, TrackerInfo]:
-    """The tracks after a scan, given association probabilities; the newborn among what they leave unexplained."""
+def update_tracks(state: Tracks, scan: Scan, found: Association, logic: TrackLogic) -> tuple[Tracks, TrackerInfo]:
+    """The tracks after a scan, given association probabilities; unexplained measurements initiate new tracks."""
     left = miss(state.existence, scan.detection)
     hit = 1.0 - found.missed
     existence = hit + found.missed * left
-    there = jnp.where(existence > 0.0, existence, 1.0)
-    moved = match_moments(state.states, scan.comparison, found.pairs / there[:, None])
-    states = jax.vmap(select)(jnp.any(found.pairs > 0.0, axis=1), moved, state.states)
+    divisor = jnp.where(existence > 0.0, existence, 1.0)
+    moved = match_moments(state.states, scan.comparison, found.pairs / divisor[:, None])
+    states = jax.vmap(tree.where)(jnp.any(found.pairs > 0.0, axis=1), moved, state.states)
     aged = age_tracks(state, states, existence, hit > 0.5)
     unexplained = 1.0 - jnp.sum(found.pairs, axis=0)
     newborn = jnp.where(unexplained > 0.5, unexplained * scan.share, 0.0)
-    after, crowded = renew(aged, scan.newborn.states, newborn, life)
+    after, crowded = manage_tracks(aged, scan.newborn.states, newborn, logic)
     likelihood = scan.base + found.log_normalizer
-    ok = whole(after, likelihood)
-    after = select(ok, after, state)
+    ok = tree.all_finite((after, likelihood))
+    after = tree.where(ok, after, state)
     return after, TrackerInfo(jnp.where(ok, likelihood, 0.0), ok, jnp.sum(after.existence), crowded)
 
 
 def match_moments(states: GaussianState, comparison: Comparison, weights: Float[Array, "k m"]) -> GaussianState:
-    """One normal density for each mixture over measurements (and none): same mean, same covariance.
+    """The normal density with the moments of each track's mixture over its measurements and the missed detection.
 
-    With the root ``[[V, 0], [G, S]]`` of (measurement, state) and innovations in sigmas ``e_j``: the mean moves by
+    With the root ``[[V, 0], [G, S]]`` of (measurement, state) and whitened innovations ``e_j``: the mean moves by
     ``G sum_j beta_j e_j``, and ``P = S S^T + G (beta_0 I + cov e) G^T``. Everything added is positive, and none of the
     densities of the mixture is formed.
 
@@ -186,13 +158,13 @@ def match_moments(states: GaussianState, comparison: Comparison, weights: Float[
         size = residuals.shape[-1]
         none = jnp.maximum(1.0 - jnp.sum(beta), 0.0)
         shift = jnp.sum(beta[:, None] * residuals, axis=0)
-        apart = jnp.sqrt(_positive(beta))[:, None] * (residuals - shift[None, :])
-        apart = jnp.where(beta[:, None] > 0.0, apart, 0.0)
-        spread = none * (jnp.eye(size, dtype=root.dtype) + shift[:, None] * shift[None, :])
-        middle = cholesky(spread + jnp.sum(apart[:, :, None] * apart[:, None, :], axis=0))
+        deviations = jnp.sqrt(_positive(beta))[:, None] * (residuals - shift[None, :])
+        deviations = jnp.where(beta[:, None] > 0.0, deviations, 0.0)
+        missed = none * (jnp.eye(size, dtype=root.dtype) + shift[:, None] * shift[None, :])
+        middle = cholesky(missed + jnp.sum(deviations[:, :, None] * deviations[:, None, :], axis=0))
         gain, rest = root[size:, :size], root[size:, size:]
         both = triangularize(jnp.concatenate([rest, product(gain, middle)], axis=1))
-        mean, both = recenter(state.mean, product(gain, shift), both)
+        mean, both = retract_root(state.mean, product(gain, shift), both)
         return GaussianState(mean, both, state.step)
 
     return jax.vmap(one)(states, comparison.roots, comparison.residuals, weights)

@@ -40,7 +40,7 @@ def test_order_and_scale_do_not_matter(rng):
     assert np.array_equal(forward, np.asarray(backward)[::-1])
 
 
-def test_bad_weights():
+def test_nonfinite_weights():
     assert bounded_values(jnp.array([jnp.nan, jnp.inf, -jnp.inf])).tolist() == [1.0, 1.0, 1.0]
     assert bounded_values(jnp.array([-1e30, -1e30])).tolist() == [1.0, 1.0]
     assert bounded_values(jnp.array([0.0, -math.log(2.0), jnp.nan])).round(6).tolist() == [1.0, 0.5, 0.0]

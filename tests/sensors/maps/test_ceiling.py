@@ -52,7 +52,7 @@ def test_likelihood_peaks_at_the_truth(mosaic):  # R-12: of many readings along 
     assert np.argmax(at) == 0 and at[0] > max(at[1:]) + 20.0
 
 
-def test_bad_readings_and_places(mosaic):
+def test_nonfinite_readings_and_places(mosaic):
     sensor = CeilingSensor(mosaic, 0.1)
     there, far = SE2(0.0, 3.0, 0.0), SE2(99.0, 3.0, 0.0)
     yes, no = jnp.array(True), jnp.array(False)

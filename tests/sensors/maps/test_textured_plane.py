@@ -30,11 +30,11 @@ def test_prediction_equals_a_warped_map(rng, x64):
     camera, pose = Pinhole(*CAMERA), looking(plane)
     matrix = np.asarray(plane.homography(camera, pose).matrix())
     expected = cv2.warpPerspective(texture, matrix, SHAPE[::-1], flags=cv2.INTER_LINEAR)
-    picture = plane.predict(camera, pose, shape=SHAPE)
-    seen = cv2.erode(np.asarray(picture.seen).astype(np.uint8), np.ones((5, 5))).astype(bool)
+    found = plane.predict(camera, pose, shape=SHAPE)
+    seen = cv2.erode(np.asarray(found.seen).astype(np.uint8), np.ones((5, 5))).astype(bool)
     assert seen.mean() > 0.4
     # OpenCV rounds coordinates to 1/32 px.
-    np.testing.assert_allclose(np.asarray(picture.image)[seen], expected[seen], atol=1.5)
+    np.testing.assert_allclose(np.asarray(found.image)[seen], expected[seen], atol=1.5)
 
 
 def test_homography_and_projection_agree(rng, x64):
@@ -58,8 +58,8 @@ def test_lens_and_gradient(rng, x64):
     pixels = jnp.array([[40.0, 30.0], [47.0, 36.0]])
     uv = camera.project(pose.inverse().apply(plane.points(pixels)))
     column, row = int(round(float(uv[0, 0]))), int(round(float(uv[0, 1])))
-    picture = plane.predict(camera, pose, shape=SHAPE).image
-    assert abs(float(picture[row, column]) - texture[30, 40]) < 6
+    found = plane.predict(camera, pose, shape=SHAPE).image
+    assert abs(float(found[row, column]) - texture[30, 40]) < 6
     with pytest.raises(ValueError, match="lens"):
         plane.homography(camera, pose)
     value = lambda d: jnp.sum(plane.predict(camera, pose.retract(d), shape=SHAPE).image[20:40, 25:50] ** 2)  # noqa: E731
@@ -77,7 +77,7 @@ def test_a_camera_that_looks_away_sees_nothing(plane):
     )
     along = plane.T_world_plane @ SE3.exp(jnp.array([0.9, 0.7, 0.0, 0.0, 0.0, 0.0]))
     for pose in (away, along):
-        picture = plane.predict(Pinhole(*CAMERA), pose, shape=SHAPE)
-        assert not np.any(picture.seen) and np.all(np.asarray(picture.image) == 0)
+        found = plane.predict(Pinhole(*CAMERA), pose, shape=SHAPE)
+        assert not np.any(found.seen) and np.all(np.asarray(found.image) == 0)
         slope = jax.jacfwd(lambda d: plane.predict(Pinhole(*CAMERA), pose.retract(d), shape=SHAPE).image.sum())  # noqa: B023
         assert np.all(np.isfinite(slope(jnp.zeros(6))))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc import _tree as tree
-from jaxloc.alignment.lucas_kanade.covariance import Evidence, conclude, follow_root
+from jaxloc.alignment.lucas_kanade.covariance import AlignmentEquations, Evidence, conclude
 from jaxloc.alignment.lucas_kanade.iteration import Descended, Limits, descend
 from jaxloc.alignment.lucas_kanade.normal_equations import zero_brightness
 from jaxloc.alignment.lucas_kanade.options import LucasKanade
@@ -16,6 +16,7 @@ from jaxloc.alignment.lucas_kanade.pyramid_level import Frame, Level
 from jaxloc.images.normalization import as_gray
 from jaxloc.images.warps import Warp
 from jaxloc.solvers import Estimate
+from jaxloc.solvers.implicit_gradient import attach_gradient
 
 
 def align(
@@ -130,7 +131,7 @@ def search(evidence: Evidence, levels: list[Level], warp: Warp, brightness: Floa
 def estimate(evidence: Evidence, found: Descended, finite: Bool[Array, ""]) -> Estimate:
     """Judges where a search ended, and gives it the derivatives of a solution."""
     judged = conclude(jax.lax.stop_gradient(evidence), found.warp, found.brightness, found.moved, finite)
-    followed = follow_root(found.warp, evidence, found.brightness, judged.ok)
+    followed = attach_gradient(found.warp, AlignmentEquations(evidence, found.brightness), judged.ok)
     value = evidence.frame.denormalize(followed)
     return Estimate(
         value, judged.covariance, judged.cost, judged.ok, found.num_steps, judged.status, judged.information

@@ -5,8 +5,6 @@ template's: not the derivative of any cost. So covariance and derivatives are th
 the images' noise carried through g.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,6 +21,7 @@ from jaxloc.alignment.lucas_kanade.scales import Scaled
 from jaxloc.images.warps import Warp
 from jaxloc.solvers.cholesky import factor
 from jaxloc.solvers.estimate import Status
+from jaxloc.solvers.implicit_gradient import Equations
 
 
 class Evidence(eqx.Module):
@@ -117,31 +116,29 @@ def exact_slope(level: Level, warp: Warp, brightness: Float[Array, " k"], matchi
     return jax.jacfwd(lambda delta: score(level, warp.retract(delta), brightness, matching))(zero)
 
 
-@eqx.filter_custom_jvp
-def follow_root(warp: Warp, evidence: Evidence, brightness: Float[Array, " k"], ok: Bool[Array, ""]) -> Warp:
-    """The warp itself, with the derivatives that a root of the score has where ``ok``, and none elsewhere."""
-    del evidence, brightness, ok
-    return warp
+class AlignmentEquations(Equations):
+    """The estimating equations as equations of the warp, for derivatives of the solution by the images.
 
+    Attributes:
+        evidence: the images.
+        brightness: coefficients of its columns.
+    """
 
-@follow_root.def_jvp
-def _follow_root_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    warp, evidence, brightness, ok = primals
-    evidence_tangent = tangents[1]
-    warp = follow_root(warp, evidence, brightness, ok)
-    is_none = lambda node: node is None  # noqa: E731
-    moving = jax.tree.map(lambda t, leaf: None if t is None else leaf, evidence_tangent, evidence, is_leaf=is_none)
-    fixed = jax.tree.map(lambda t, leaf: leaf if t is None else None, evidence_tangent, evidence, is_leaf=is_none)
+    evidence: Evidence
+    brightness: Float[Array, " k"]
 
-    def at(perturbed: Evidence) -> Float[Array, " d"]:
-        whole = eqx.combine(perturbed, fixed)
-        return score(whole.finest(), warp, brightness, whole.matching)
+    def residual(self, value: Warp) -> Float[Array, " d"]:
+        """The score at the finest scale."""
+        return score(self.evidence.finest(), value, jax.lax.stop_gradient(self.brightness), self.evidence.matching)
 
-    _, change = jax.jvp(at, (moving,), (evidence_tangent,))
-    by_warp = exact_slope(evidence.finest(), warp, brightness, evidence.matching)
-    delta = jnp.where(ok, -_solve(by_warp, change, ok), 0.0)
-    _, tangent = jax.jvp(warp.retract, (jnp.zeros_like(delta),), (delta,))
-    return warp, tangent
+    def solve(self, value: Warp, right: Float[Array, " d"], ok: Bool[Array, ""]) -> Float[Array, " d"]:
+        """By the exact derivative of the score."""
+        matrix = exact_slope(self.evidence.finest(), value, self.brightness, self.evidence.matching)
+        return _solve(matrix, right, ok)
+
+    def move(self, value: Warp, delta: Float[Array, " d"]) -> Warp:
+        """By the warp's own retraction."""
+        return value.retract(delta)
 
 
 def _solve(matrix: Float[Array, "d d"], vector: Float[Array, " d"], ok: Bool[Array, ""]) -> Float[Array, " d"]:

@@ -1,4 +1,4 @@
-"""Cumulative weights in integers: exact for any number of particles, in any order of summing."""
+"""Cumulative weights in fixed point: exact for any number of particles, in any order of summation."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ class Boundaries(eqx.Module):
         whole: integer part.
         fraction: in units of ``2^-32``.
         share: each one's own share, rounded to single precision.
-        last: the last place with a share.
+        last: the last index with a share.
     """
 
     whole: Int[Array, " m"]
@@ -25,7 +25,7 @@ class Boundaries(eqx.Module):
 
 
 def bounded_values(log_weights: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Weights over the greatest one, in single precision; equal ones where all are zero or no finite numbers.
+    """Weights over the largest one, in single precision; equal ones where all are zero or non-finite.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -43,14 +43,14 @@ def boundaries(values: Float[Array, " m"], count: Int[Array, ""]) -> Boundaries:
     """Cumulative sums of ``count v_i / sum v`` in 64-bit fixed point, made of two 32-bit integers.
 
     In single precision a cumulative sum of 1e6 shares is off by whole shares. Here each share is split into its integer
-    part and a fraction of 32 bits; the fractions are added with wrap-around, which happened wherever a sum is less than
-    its last term, and the wraps are added to the integer parts. Integer sums do not depend on their order, so that
-    particles spread over devices get the same numbers. What rounding of the shares leaves of the total is spread again
-    in proportion.
+    part and a fraction of 32 bits; the fractions are added with wrap-around, which occurred wherever a sum is less than
+    its last term, and the carries are added to the integer parts. Integer sums do not depend on their order, so that
+    particles sharded over devices give the same numbers. The rounding error of the total is distributed in
+    proportion.
 
     Args:
-        values: in [0, 1], with the greatest near 1, single precision.
-        count: what the shares add up to.
+        values: in [0, 1], with the largest near 1, single precision.
+        count: sum of the shares.
 
     Returns:
         The cumulative sums, whose last one is the count to ``2^-24`` of a share.
@@ -84,7 +84,7 @@ def _split(numbers: Array) -> tuple[Array, Array]:
 
 
 def _total(values: Array) -> Array:
-    """Sum of values in [0, 1] by three integer digits: near enough, and the same in any order of adding."""
+    """Sum of values in [0, 1] in three integer digits: accurate, and the same in any order of summation."""
     unit = 2.0 ** (31 - values.shape[0].bit_length())
     total, scale, rest = jnp.zeros((), jnp.float32), 1.0, jnp.minimum(values, 1.0)
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""Resampling schemes: indices of the particles that are drawn, in linear time without a search."""
+"""Resampling schemes: systematic, stratified, multinomial, residual and soft, as indices in linear time."""
 
 import math
 from collections.abc import Callable
@@ -20,13 +20,13 @@ def systematic(
     """Ancestors at the points ``(j + u) / n`` of the cumulative weights, one random number for all.
 
     The number of copies of a particle is ``n w`` rounded down or up, and ``n w`` on average. The cumulative sum is in
-    integers: exact for millions of particles, and the same however they are spread over devices.
+    integers: exact for millions of particles, and the same for any sharding over devices.
 
     Args:
         key: random key.
-        log_weights: of any common offset; a weight that is no finite number is zero; where all are zero, all are equal.
+        log_weights: of any common offset; non-finite weights count as zero; where all are zero, all are equal.
         n: number of ancestors drawn.
-        count: draw only so many, the rest of the ancestors is meaningless; None for n.
+        count: number to draw; the rest of the ancestors is undefined. None for n.
 
     Returns:
         Indices in ascending order; they carry no gradient (see `Systematic` for the weights that do).
@@ -129,7 +129,7 @@ def residual(
     """
     total = _count(n, count)
     bounds = boundaries(bounded_values(log_weights), total)
-    # A share that is whole but for rounding is whole.
+    # A share within rounding of an integer counts as that integer.
     copies = jnp.floor(bounds.share * (1.0 + 4.0 * _ROUNDING)).astype(jnp.int32)
     missing = jnp.maximum(total - jnp.sum(copies, dtype=jnp.int32), 0)
     rest = boundaries(jnp.maximum(bounds.share - copies.astype(jnp.float32), 0.0), missing)
@@ -147,16 +147,16 @@ def soft(
 ) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
     """Ancestors from the mixture ``q = a w + (1 - a) / m``, with log weights ``log(w / q / n)`` that carry gradients.
 
-    What is biased: the gradient. Weights and estimates are right (on average, with more variance than `systematic`),
-    and so is the likelihood; but no derivative passes through the choice of ancestors, so that the score is wrong by
-    a part that shrinks as ``a`` goes to zero, where nothing is resampled.
+    The gradient is biased. Weights, estimates and the likelihood are unbiased (with more variance than `systematic`);
+    but no derivative passes through the choice of ancestors, which biases the score by a part that vanishes as ``a``
+    goes to zero, where nothing is resampled.
 
     Args:
         key: random key.
         log_weights: as for `systematic`.
         n: number of ancestors drawn.
         alpha: part of the weights in the mixture, in (0, 1].
-        scheme: how the ancestors are drawn.
+        scheme: resampling scheme.
 
     Returns:
         Indices, and the log weights of the drawn particles.
@@ -187,11 +187,11 @@ def _count(n: int, count: Array | None) -> Array:
 
 
 def _ancestors(below: Array, last: Array, n: int) -> Array:
-    """For each of n points the number of boundaries at or before it: the particle in whose share it lies.
+    """Index of the particle in whose share each of n points lies: the number of boundaries at or before it.
 
     Args:
-        below: for each particle how many points lie before the end of its share.
-        last: the last particle of any weight.
+        below: for each particle, the number of points before the end of its share.
+        last: the last particle of nonzero weight.
         n: number of points.
     """
     ends = jnp.zeros(n + 1, jnp.int32).at[jnp.clip(below, 0, n)].add(1, mode="promise_in_bounds")
@@ -199,7 +199,7 @@ def _ancestors(below: Array, last: Array, n: int) -> Array:
 
 
 def _points_below(key: Array, bounds: Boundaries, n: int, count: Array) -> Array:
-    """How many of `count` independent uniform points lie before each boundary."""
+    """Number of `count` independent uniform points before each boundary."""
     key_cell, key_fraction = jax.random.split(key)
     cells = jax.random.randint(key_cell, (n,), 0, jnp.maximum(count, 1), jnp.int32)
     used = (jnp.arange(n, dtype=jnp.int32) < count).astype(jnp.int32)
@@ -215,5 +215,5 @@ def _points_below(key: Array, bounds: Boundaries, n: int, count: Array) -> Array
         return place + 1, found + ((place < cell_load) & (point < bounds.fraction)).astype(jnp.int32)
 
     most = jnp.max(load)
-    start = (jnp.zeros((), jnp.int32), cell_first)
-    return lax.while_loop(lambda carry: carry[0] < most, compare, start)[1]
+    initial = (jnp.zeros((), jnp.int32), cell_first)
+    return lax.while_loop(lambda carry: carry[0] < most, compare, initial)[1]

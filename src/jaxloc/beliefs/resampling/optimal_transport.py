@@ -1,4 +1,4 @@
-"""Particles moved to equal weights by optimal transport: no draws, and a gradient through every step."""
+"""Resampling by entropy-regularized optimal transport: deterministic and differentiable."""
 
 import math
 from typing import Any
@@ -16,14 +16,14 @@ from jaxloc.poses import retract
 def optimal_transport(
     values: Any, log_weights: Float[Array, " n"], *, epsilon: float = 0.1, iterations: int = 30
 ) -> Any:
-    """Equal particles, each a blend of the weighted ones by the entropic transport plan between the two sets.
+    """Equally weighted particles, each a convex combination of the weighted ones by the entropic transport plan.
 
-    ``x_i' = retract(m, n sum_j P_ij local(m, x_j))`` about the mean m, where P moves the weights to equal ones at the
-    least squared distance, less ``epsilon`` (times the mean square between particles) times its entropy. Sinkhorn's
-    iterations run in logarithms, with an epsilon that shrinks to its value. Time and memory grow with n squared.
+    ``x_i' = retract(m, n sum_j P_ij local(m, x_j))`` about the mean m, where P transports the weights to equal ones
+    at the least squared distance, less ``epsilon`` (times the mean squared distance between particles) times its
+    entropy. Sinkhorn's iterations run in logarithms, with a decreasing epsilon. Time and memory grow with n squared.
 
-    What is biased: the particles. Blending pulls them together (the mean is kept, all else shrinks, and estimates of
-    the likelihood are off), the more so the larger epsilon is; the gradient is the exact one of that biased filter.
+    The particles are biased: combinations shrink the covariance (the mean is kept) and bias estimates of the
+    likelihood, the more the larger epsilon is; the gradient is the exact one of that biased filter.
 
     Args:
         values: particles, a pytree stacked along the leading axis.
@@ -32,7 +32,7 @@ def optimal_transport(
         iterations: steps of Sinkhorn's algorithm.
 
     Returns:
-        Values of equal weight, stacked as they came.
+        Values of equal weight, stacked.
 
     References:
         Corenflos, Thornton, Deligiannidis, Doucet, "Differentiable particle filtering via entropy-regularized optimal
@@ -49,13 +49,13 @@ def optimal_transport(
     center = cloud.mean()
     deltas = cloud.deviations(center)
     moved = matmul(_transport_plan(deltas, cloud.log_weights, epsilon, iterations), deltas)
-    # A plan that has not settled moves the mean: that part is taken back.
+    # A plan that has not converged moves the mean: that part is subtracted.
     moved = moved + (jnp.sum(cloud.weights[:, None] * deltas, axis=0) - jnp.mean(moved, axis=0))[None, :]
     return jax.vmap(lambda delta: retract(center, delta))(moved)
 
 
 def _transport_plan(points: Array, log_weights: Array, epsilon: float, iterations: int) -> Array:
-    """Rows of weights that sum to one: n times the entropic plan from the weights to equal ones."""
+    """Rows that sum to one: n times the entropic plan from the weights to equal ones."""
     squares = jnp.sum(points**2, axis=1)
     cost = jnp.maximum(squares[:, None] + squares[None, :] - 2.0 * matmul(points, points.T), 0.0)
     extent = lax.stop_gradient(jnp.mean(cost))
@@ -67,7 +67,7 @@ def _transport_plan(points: Array, log_weights: Array, epsilon: float, iteration
         rows = -scale * jax.nn.logsumexp((potential[None, :] - cost) / scale + log_weights[None, :], axis=1)
         return -scale * jax.nn.logsumexp((rows[:, None] - cost) / scale + level, axis=0), None
 
-    # Each step halves epsilon until it has its value: far potentials are settled while steps are wide.
+    # Each step halves epsilon down to its value, which converges faster than a fixed one.
     scales = jnp.maximum(2.0 ** (-jnp.arange(iterations, dtype=points.dtype)), epsilon)
     potential, _ = lax.scan(iterate, jnp.zeros(points.shape[0], points.dtype), scales)
     return jax.nn.softmax((potential[None, :] - cost) / epsilon + log_weights[None, :], axis=1)

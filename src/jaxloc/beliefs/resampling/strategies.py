@@ -1,4 +1,4 @@
-"""Resampling strategies of particle filters: records that draw equally weighted particles."""
+"""Resampling strategies of particle filters."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -19,8 +19,8 @@ class Resampled(eqx.Module):
     """Particles after resampling.
 
     Attributes:
-        particles: as many as before; their log weights keep the total that they had.
-        ancestors: which particle each was.
+        particles: as many as before; the total weight is unchanged.
+        ancestors: index of the particle that each is a copy of.
     """
 
     particles: Particles
@@ -28,22 +28,22 @@ class Resampled(eqx.Module):
 
 
 class Resampling(eqx.Module):
-    """How a filter resamples.
+    """A resampling strategy.
 
     Attributes:
-        pathwise: whether its gradient is meant to pass along the particles, rather than by the score of the draws.
+        pathwise: whether its gradient passes through the particles, instead of the score function of the draws.
     """
 
     pathwise: eqx.AbstractClassVar[bool]
 
     @abstractmethod
     def resample(self, particles: Particles, *, key: Key[Array, ""], count: Int[Array, ""] | None = None) -> Resampled:
-        """Particles of nearly equal weights for the same density.
+        """Particles of (nearly) equal weights for the same density.
 
         Args:
             particles: weighted.
             key: random key.
-            count: how many of the places to fill; None for all of them.
+            count: number of slots to fill; None for all.
         """
 
 
@@ -88,7 +88,7 @@ class Residual(Resampling):
 
 
 class Soft(Resampling):
-    """`soft` resampling: a gradient of little variance through the weights, which is biased."""
+    """`soft` resampling: a low-variance, biased gradient through the weights."""
 
     alpha: float = eqx.field(static=True, default=0.5)
 
@@ -103,9 +103,9 @@ class Soft(Resampling):
 
 
 class OptimalTransport(Resampling):
-    """`optimal_transport` of the cloud: no draws, particles that are blends and biased; n^2 time and memory.
+    """`optimal_transport` of the particles: deterministic, biased combinations; n^2 time and memory.
 
-    It has no ancestors: particle i stands at place i.
+    It has no ancestors: particle i stays in slot i.
     """
 
     epsilon: float = eqx.field(static=True, default=0.1)
@@ -114,7 +114,7 @@ class OptimalTransport(Resampling):
     pathwise = True
 
     def resample(self, particles: Particles, *, key: Key[Array, ""], count: Any = None) -> Resampled:
-        """Transports the cloud; see `Resampling`."""
+        """Transports the particles; see `Resampling`."""
         _refuse_count(self, count)
         moved = optimal_transport(
             particles.values, finite_log_weights(particles), epsilon=self.epsilon, iterations=self.iterations
@@ -130,18 +130,18 @@ def by_ancestors(
     key: Key[Array, ""],
     count: Int[Array, ""] | None = None,
 ) -> Resampled:
-    """Copies of drawn ancestors, whose equal weights carry the gradient of having been drawn.
+    """Copies of sampled ancestors, whose equal weights carry the score-function gradient of the sampling.
 
-    The log weight of a copy is ``log w_a - stop(log w_a)`` and the common level. Its value is equal for all; its
-    derivative is the score of the choice of a. What is biased: nothing but what the particle filter itself is. The
-    gradient of the log likelihood has the expectation of the exact score up to terms that vanish with the number of
-    particles, at a variance that grows with the length of the recording.
+    The log weight of a copy is ``log w_a - stop(log w_a)`` plus a constant: equal for all, with the score of the choice
+    of a as derivative. It adds no bias to that of the particle filter. The gradient of the log likelihood has the
+    expectation of the exact score up to terms that vanish with the number of particles, at a variance that grows with
+    the length of the recording.
 
     Args:
-        scheme: `systematic` or one of its kin.
+        scheme: `systematic`, `stratified`, `multinomial` or `residual`.
         particles: weighted.
         key: random key.
-        count: how many of the places to fill; the others become invalid. None for all.
+        count: number of slots to fill; the others become invalid. None for all.
 
     References:
         Scibior and Wood, "Differentiable particle filtering without modifying the forward pass", 2021, algorithm 1.
@@ -158,10 +158,10 @@ def by_ancestors(
 
 
 def _placed(resampled: Resampled, particles: Particles) -> Resampled:
-    """Resampled particles on the devices that hold the given ones; compilers would gather them on each."""
+    """Resampled particles with the sharding of the given ones; the compiler would gather them on each device."""
     return shard_like(resampled, (particles, particles.log_weights))
 
 
 def _refuse_count(strategy: Resampling, count: Any) -> None:
     if count is not None:
-        raise ValueError(f"{type(strategy).__name__} fills every place; resample to a count with Systematic().")
+        raise ValueError(f"{type(strategy).__name__} fills every slot; resample to a count with Systematic().")

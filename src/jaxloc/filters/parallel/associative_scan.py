@@ -1,8 +1,8 @@
-"""Blocks of linear steps side by side, joined by an associative scan: the engine of filters parallel in time.
+"""Associative scan over blocks of linear-Gaussian steps, for filters and smoothers parallel in time.
 
-What a block of steps says is a `Block`: its last state as a function of the one before its first, and a likelihood of
-that one. Blocks combine associatively, so that all their first states follow in a logarithmic number of steps; the rest
-happens in all blocks at once. Everything is in square-root form.
+A block of steps is summarized as a `Block`: its last state as a function of the state before it, and a likelihood of
+that state. Blocks combine associatively, so that their initial states follow in a logarithmic number of steps; the
+steps inside the blocks run in parallel. All covariances are in square-root form.
 
 References:
     Särkkä and García-Fernández, "Temporal parallelization of Bayesian smoothers", IEEE TAC 2021; Yaghoobi, Corenflos,
@@ -19,8 +19,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _tree as tree
 from jaxloc.beliefs.square_root import product, triangularize, whiten
-from jaxloc.filters.kalman import Reading, Spread, judge, regular, select
+from jaxloc.filters.kalman import Innovation, JointCovariance, innovation_info, without_zero_pivots
 
 
 class Linearized(eqx.Module):
@@ -36,10 +37,10 @@ class Linearized(eqx.Module):
 
 
 class Block(eqx.Module):
-    """What some steps say: ``x_j = gain x_i + offset + root w``, and the log likelihood ``s x_i - |Z^T x_i|^2 / 2``.
+    """Consecutive steps: ``x_j = gain x_i + offset + root w``, with log likelihood ``s x_i - |Z^T x_i|^2 / 2``.
 
     Attributes:
-        gain, offset, root: of the last state, given the one before the first.
+        gain, offset, root: of the last state, given the state before the first step.
         score: s.
         information_root: Z.
     """
@@ -52,7 +53,7 @@ class Block(eqx.Module):
 
 
 class Line(eqx.Module):
-    """Some steps backwards: ``x_i = gain x_j + offset + root w``."""
+    """Backward conditional of consecutive steps: ``x_i = gain x_j + offset + root w``."""
 
     gain: Float[Array, "*t d d"]
     offset: Float[Array, "*t d"]
@@ -74,7 +75,7 @@ def filter_blocks(steps: Linearized, prior: tuple[Array, Array], num_blocks: int
 
 
 def smooth_blocks(lines: Line, end: tuple[Array, Array], num_blocks: int) -> tuple[Array, Array]:
-    """Tangents and roots at all points of a chain of lines, from the last one."""
+    """Smoothed tangents and roots along a chain of backward conditionals, from the last one."""
     count = lines.offset.shape[0]
     if count == 0:
         return jax.tree.map(lambda leaf: leaf[None], end)
@@ -88,7 +89,7 @@ def smooth_blocks(lines: Line, end: tuple[Array, Array], num_blocks: int) -> tup
 
     whole = jax.vmap(lambda block: lax.scan(compose, still, block, reverse=True)[0])(blocks)
     joined = scan_associative(_chain, whole, reverse=True)
-    # What each block begins from: the end, carried back through the blocks after it.
+    # The last state of each block: the end, transported back through the blocks after it.
     carried = jax.vmap(lambda line: _apply(line, end))(jax.tree.map(lambda leaf: leaf[1:], joined))
     starts = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), carried, end)
 
@@ -106,16 +107,16 @@ def _advance(before: tuple[Array, Array], step: Linearized) -> tuple[tuple[Array
     delta, root = _moved(delta, root, step)
     joint = _joint(root, step)
     size = step.residual.shape[0]
-    spread = Spread(None, joint[:size], joint[size:])
-    info = judge(joint, Reading(spread, step.residual - product(step.matrix, delta), step.mask))
+    covariance = JointCovariance(None, joint[:size], joint[size:])
+    info = innovation_info(joint, Innovation(covariance, step.residual - product(step.matrix, delta), step.mask))
     used = info.ok & (info.dof > 0)
-    change = product(joint[size:, :size], whiten(regular(joint[:size, :size]), info.innovation))
-    after = select(used, (delta + change, joint[size:, size:]), (delta, root))
+    change = product(joint[size:, :size], whiten(without_zero_pivots(joint[:size, :size]), info.innovation))
+    after = tree.where(used, (delta + change, joint[size:, size:]), (delta, root))
     return after, (after, info)
 
 
 def _summarize(steps: Linearized) -> Block:
-    """A block: the filter from a start that is known, and how its innovations depend on that start."""
+    """Summary of a block: the filter from a known initial state, and how its innovations depend on that state."""
     size = steps.offset.shape[-1]
     eye, zero = jnp.eye(size, dtype=steps.gain.dtype), jnp.zeros(size, steps.gain.dtype)
 
@@ -123,26 +124,26 @@ def _summarize(steps: Linearized) -> Block:
         gain, (delta, root) = before
         gain, (delta, root) = product(step.gain, gain), _moved(delta, root, step)
         joint, seen = _joint(root, step), step.residual.shape[0]
-        spread = regular(joint[:seen, :seen])
-        reading = whiten(spread, step.residual - product(step.matrix, delta))
-        rows = whiten(spread, product(step.matrix, gain))
+        measured = without_zero_pivots(joint[:seen, :seen])
+        white = whiten(measured, step.residual - product(step.matrix, delta))
+        rows = whiten(measured, product(step.matrix, gain))
         change = joint[seen:, :seen]
-        after = (delta + product(change, reading), joint[seen:, seen:])
-        return (gain - product(change, rows), after), (rows, reading)
+        after = (delta + product(change, white), joint[seen:, seen:])
+        return (gain - product(change, rows), after), (rows, white)
 
-    (gain, (delta, root)), (rows, readings) = lax.scan(advance, (eye, (zero, jnp.zeros_like(eye))), steps)
+    (gain, (delta, root)), (rows, residuals) = lax.scan(advance, (eye, (zero, jnp.zeros_like(eye))), steps)
     rows = rows.reshape(-1, size)
-    return Block(gain, delta, root, product(rows.T, readings.reshape(-1)), triangularize(rows.T))
+    return Block(gain, delta, root, product(rows.T, residuals.reshape(-1)), triangularize(rows.T))
 
 
 def _join(first: Block, second: Block) -> Block:
-    """Two blocks as one."""
+    """Two consecutive blocks combined."""
     root, known = first.root, second.information_root
     size = root.shape[0]
     eye = jnp.eye(size, dtype=root.dtype)
     both = triangularize(jnp.block([[product(root.T, known), eye], [known, jnp.zeros_like(eye)]]))
     scale, across, left = both[:size, :size], both[size:, :size], both[size:, size:]
-    # Of the state between the blocks: its root given what the second says, and the part of it that remains.
+    # Root of the state between the blocks given the measurements of the second, and its remaining part.
     between = whiten(scale, root.T).T
     keep = eye - product(between, across.T)
     score = product(keep.T, second.score - product(known, product(known.T, first.offset)))
@@ -158,7 +159,7 @@ def _join(first: Block, second: Block) -> Block:
 
 
 def _after_prior(blocks: Block, prior: tuple[Array, Array]) -> Block:
-    """The blocks with the prior put into the first: its last state depends on nothing before it."""
+    """The blocks with the prior included in the first, whose last state then depends on nothing before it."""
     zero = jnp.zeros_like(prior[1])
     start = Block(zero, prior[0], prior[1], jnp.zeros_like(prior[0]), zero)
     first = _join(start, jax.tree.map(lambda leaf: leaf[0], blocks))
@@ -176,8 +177,8 @@ def _apply(line: Line, later: tuple[Array, Array]) -> tuple[Array, Array]:
 
 
 def _moved(delta: Array, root: Array, step: Linearized) -> tuple[Array, Array]:
-    spread = jnp.concatenate([product(step.gain, root), step.noise], axis=1)
-    return product(step.gain, delta) + step.offset, triangularize(spread)
+    deviations = jnp.concatenate([product(step.gain, root), step.noise], axis=1)
+    return product(step.gain, delta) + step.offset, triangularize(deviations)
 
 
 def _joint(root: Array, step: Linearized) -> Array:
@@ -186,14 +187,14 @@ def _joint(root: Array, step: Linearized) -> Array:
     return triangularize(jnp.concatenate([jnp.concatenate(row, axis=1) for row in rows]))
 
 
-def hold(line: Line, here: Bool[Array, ""]) -> Line:
-    """A line, or the one that leaves everything as it is."""
+def hold(line: Line, active: Bool[Array, ""]) -> Line:
+    """The line where active, else the identity."""
     eye = jnp.eye(line.offset.shape[0], dtype=line.offset.dtype)
-    return select(here, line, Line(eye, jnp.zeros_like(line.offset), jnp.zeros_like(eye)))
+    return tree.where(active, line, Line(eye, jnp.zeros_like(line.offset), jnp.zeros_like(eye)))
 
 
 def _idle(steps: Linearized) -> Linearized:
-    """A step in which nothing moves and nothing is seen."""
+    """A step without motion and measurement."""
     size, seen = steps.offset.shape[-1], steps.residual.shape[-1]
     dtype = steps.gain.dtype
     eye, zero = jnp.eye(size, dtype=dtype), jnp.zeros(size, dtype)
@@ -202,7 +203,7 @@ def _idle(steps: Linearized) -> Linearized:
 
 
 def _cut(steps: Any, num_blocks: int, filler: Any) -> Any:
-    """Steps as blocks of equal length, the last one filled up."""
+    """Steps as blocks of equal length, the last one padded."""
 
     def cut(leaf, fill):
         length = -(-leaf.shape[0] // num_blocks)
@@ -220,8 +221,8 @@ def _uncut(blocks: Any, count: int) -> Any:
 def scan_associative(combine: Callable[[Any, Any], Any], items: Any, *, reverse: bool = False) -> Any:
     """Running combinations of stacked items by an associative operation, in a logarithmic number of steps.
 
-    Unlike `jax.lax.associative_scan` it combines all items in each step (Hillis and Steele), which leaves one copy of
-    the operation to compile instead of one for each level.
+    Unlike `jax.lax.associative_scan` it combines all items in each step (Hillis and Steele), so that one copy of the
+    operation is compiled instead of one for each level.
 
     Args:
         combine: of two items, the one that comes first in the running order first.
@@ -243,6 +244,6 @@ def scan_associative(combine: Callable[[Any, Any], Any], items: Any, *, reverse:
         distance = 2**level
         shift = -distance if reverse else distance
         before = jax.tree.map(lambda leaf: jnp.roll(leaf, shift, axis=0), running)
-        return jax.vmap(select)(index >= distance, jax.vmap(combine)(before, running), running)
+        return jax.vmap(tree.where)(index >= distance, jax.vmap(combine)(before, running), running)
 
     return lax.fori_loop(0, max(count - 1, 0).bit_length(), double, items)

@@ -1,4 +1,4 @@
-"""Filters and smoothers parallel in time."""
+"""Kalman filters and smoothers parallel in time."""
 
 from typing import Any
 
@@ -8,13 +8,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _tree as tree
 from jaxloc.beliefs.models import innovation
 from jaxloc.beliefs.square_root import cholesky, product, triangularize, whiten
 from jaxloc.filters.extended import ExtendedKalmanFilter
 from jaxloc.filters.interface import GaussianState, History
-from jaxloc.filters.kalman import GaussianFilter, KalmanFilter, finite_or_zero, noise_root, recenter, select
+from jaxloc.filters.kalman import GaussianFilter, KalmanFilter, noise_root, retract_root
 from jaxloc.filters.parallel.associative_scan import Line, Linearized, filter_blocks, hold, smooth_blocks
-from jaxloc.filters.smoothers import look_back, regress
+from jaxloc.filters.smoothers import regression, reverse_step
 from jaxloc.poses import carry, is_flat, local, retract
 
 
@@ -32,18 +33,18 @@ def run_parallel(
 ) -> tuple[GaussianState, History]:
     """The filter of a whole recording at once: what `run` gives for linear models.
 
-    Models that are not linear are linearized along a nominal path: the one that the prior mean takes without
-    measurements, and in further iterations the smoothed one, which is Gauss-Newton on the whole trajectory.
+    Nonlinear models are linearized along a nominal path: the prior mean predicted without measurements, and in further
+    iterations the smoothed path, which is Gauss-Newton on the whole trajectory.
 
     Args:
-        filt: a linear or extended Kalman filter; its gate, its robust kernel and its own iterations play no part here.
-        state: where to begin.
+        filt: a linear or extended Kalman filter; its gate, robust kernel and iterations are not used.
+        state: the initial state.
         controls: stacked along the steps, or None.
         measurements: stacked along the steps.
-        valid: which measurements there are: one truth value a step, or one for each tangent direction.
-        active: which steps there are; None for all.
-        iterations: passes along the recording; 1 is enough for linear models.
-        num_blocks: blocks that run side by side; some ten for each processor core, as many as steps for an accelerator.
+        valid: mask of the measurements: one Boolean per step, or one for each tangent direction.
+        active: mask of the steps; None for all.
+        iterations: number of passes over the recording; 1 is enough for linear models.
+        num_blocks: number of parallel blocks; about ten per processor core, as many as steps on an accelerator.
 
     Returns:
         The last state, and the `History` (of the last linearization).
@@ -65,26 +66,26 @@ def run_parallel(
     """
     if iterations < 1 or num_blocks < 1:
         raise ValueError(f"A parallel run needs iterations and blocks; got {iterations} and {num_blocks}.")
-    there = jnp.ones(valid.shape[:1], bool) if active is None else active
-    controls = finite_or_zero(controls)
-    path = _drive(filt, state, controls, there)
-    num_blocks = min(num_blocks, there.shape[0])
+    active = jnp.ones(valid.shape[:1], bool) if active is None else active
+    controls = tree.finite_or_zero(controls)
+    path = _nominal_path(filt, state, controls, active)
+    num_blocks = min(num_blocks, active.shape[0])
 
     def linearized(path):
-        prior = _seen_from(jax.tree.map(lambda leaf: leaf[0], path), state)
-        steps = _linearize(filt, path, controls, measurements, valid, there)
+        prior = _tangent_at(jax.tree.map(lambda leaf: leaf[0], path), state)
+        steps = _linearize(filt, path, controls, measurements, valid, active)
         return steps, prior, filter_blocks(steps, prior, num_blocks)
 
     def again(path, _):
         steps, prior, found = linearized(path)
-        return _straighten(path, _tangent_smoothed(steps, prior, found[0], num_blocks)), (path, found)
+        return _move_path(path, _tangent_smoothed(steps, prior, found[0], num_blocks)), (path, found)
 
     if iterations > 1:
         _, passes = lax.scan(again, path, length=iterations)
         path, (filtered, infos) = jax.tree.map(lambda leaf: leaf[-1], passes)
     else:
         filtered, infos = linearized(path)[2]
-    numbers = state.step + jnp.cumsum(there, dtype=state.step.dtype)
+    numbers = state.step + jnp.cumsum(active, dtype=state.step.dtype)
     states = jax.vmap(_state)(jax.tree.map(lambda leaf: leaf[1:], path), filtered, numbers)
     return jax.tree.map(lambda leaf: leaf[-1], states), History(states, infos)
 
@@ -105,7 +106,7 @@ def smooth_parallel(
         history: of the run, with whole states.
         controls: those of the run.
         active: that of the run.
-        num_blocks: blocks that run side by side.
+        num_blocks: number of parallel blocks.
 
     Returns:
         Smoothed states, stacked along the steps.
@@ -124,12 +125,12 @@ def smooth_parallel(
         True
     """
     states = history.states
-    there = jnp.ones(states.step.shape[:1], bool) if active is None else active
-    following = jax.tree.map(lambda leaf: leaf[1:], (states.mean, controls, there))
+    active = jnp.ones(states.step.shape[:1], bool) if active is None else active
+    following = jax.tree.map(lambda leaf: leaf[1:], (states.mean, controls, active))
 
     def line(state, inputs):
         later, control, here = inputs
-        step = look_back(filt, state, control)
+        step = reverse_step(filt, state, control)
         zero = jnp.zeros(state.covariance_sqrt.shape[:1], state.covariance_sqrt.dtype)
         gain = step.gain if is_flat(later) else product(step.gain, carry(later, zero, step.mean))
         return hold(Line(gain, product(step.gain, local(step.mean, later)), step.rest), here)
@@ -138,25 +139,25 @@ def smooth_parallel(
     last = jax.tree.map(lambda leaf: leaf[-1], states)
     end = (jnp.zeros_like(last.covariance_sqrt[0]), last.covariance_sqrt)
     deltas, roots = smooth_blocks(lines, end, num_blocks)
-    mean, roots = jax.vmap(recenter)(states.mean, deltas, roots)
+    mean, roots = jax.vmap(retract_root)(states.mean, deltas, roots)
     return jax.vmap(GaussianState)(mean, roots, states.step)
 
 
-def _drive(filt: Any, state: GaussianState, controls: Any, there: Bool[Array, " t"]) -> Any:
-    """The path of the prior mean, its start included; any path serves models that are linear."""
+def _nominal_path(filt: Any, state: GaussianState, controls: Any, active: Bool[Array, " t"]) -> Any:
+    """The prior mean predicted without measurements, including the first; any path serves linear models."""
     if isinstance(filt, KalmanFilter):
-        return _broadcast(state.mean, there.shape[0] + 1)
+        return _broadcast(state.mean, active.shape[0] + 1)
 
     def advance(mean, inputs):
         control, here = inputs
-        moved = select(here, filt.motion.move(mean, control), mean)
+        moved = tree.where(here, filt.motion.move(mean, control), mean)
         return moved, moved
 
-    _, path = lax.scan(advance, state.mean, (controls, there))
+    _, path = lax.scan(advance, state.mean, (controls, active))
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state.mean, path)
 
 
-def _linearize(filt: Any, path: Any, controls: Any, measurements: Any, valid: Any, there: Any) -> Linearized:
+def _linearize(filt: Any, path: Any, controls: Any, measurements: Any, valid: Any, active: Any) -> Linearized:
     motion, sensor = filt.motion, filt.sensor
 
     def one(before, after, control, measurement, valid_here, here):
@@ -165,7 +166,7 @@ def _linearize(filt: Any, path: Any, controls: Any, measurements: Any, valid: An
         slip = local(moved, after)
         offset = -slip
         if not is_flat(before):
-            # About the noise that leads along the path, so that iterations are those of Gauss and Newton.
+            # Linearized at the noise that leads along the path, so that iterations are Gauss-Newton steps.
             turn = jax.jacfwd(lambda e: local(after, retract(retract(moved, e), slip)))(jnp.zeros_like(slip))
             gain, noise = product(turn, gain), product(carry(moved, slip, after), noise)
         forward = hold(Line(gain, offset, noise), here)
@@ -178,38 +179,38 @@ def _linearize(filt: Any, path: Any, controls: Any, measurements: Any, valid: An
         return Linearized(forward.gain, forward.offset, forward.root, matrix, residual, sensed, mask)
 
     ends = [jax.tree.map(lambda leaf, s=part: leaf[s], path) for part in (slice(None, -1), slice(1, None))]
-    return jax.vmap(one)(*ends, controls, measurements, valid, there)
+    return jax.vmap(one)(*ends, controls, measurements, valid, active)
 
 
 def _tangent_smoothed(
     steps: Linearized, prior: tuple[Array, Array], filtered: tuple[Array, Array], num_blocks: int
 ) -> Float[Array, "n d"]:
-    """Smoothed tangents of linearized steps, that of the start included."""
+    """Smoothed tangents of linearized steps, including that of the initial state."""
     deltas, roots = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), prior, filtered)
 
     def line(delta, root, step):
-        image = jnp.concatenate([product(step.gain, root), step.noise], axis=1)
-        source = jnp.concatenate([root, jnp.zeros_like(step.noise)], axis=1)
-        gain, rest = regress(triangularize(jnp.concatenate([image, source])))
+        after = jnp.concatenate([product(step.gain, root), step.noise], axis=1)
+        before = jnp.concatenate([root, jnp.zeros_like(step.noise)], axis=1)
+        gain, rest = regression(triangularize(jnp.concatenate([after, before])))
         return Line(gain, delta - product(gain, product(step.gain, delta) + step.offset), rest)
 
     lines = jax.vmap(line)(deltas[:-1], roots[:-1], steps)
     return smooth_blocks(lines, (deltas[-1], roots[-1]), num_blocks)[0]
 
 
-def _seen_from(mean: Any, state: GaussianState) -> tuple[Array, Array]:
-    """A state as a tangent at a nominal mean, and its root there."""
+def _tangent_at(mean: Any, state: GaussianState) -> tuple[Array, Array]:
+    """A state as a tangent at a nominal mean, with its root in that tangent space."""
     slip, root = local(state.mean, mean), state.covariance_sqrt
     return -slip, root if is_flat(mean) else product(carry(state.mean, slip, mean), root)
 
 
-def _straighten(path: Any, deltas: Float[Array, "n d"]) -> Any:
+def _move_path(path: Any, deltas: Float[Array, "n d"]) -> Any:
     eye = jnp.eye(deltas.shape[1], dtype=deltas.dtype)
-    return jax.vmap(lambda mean, delta: recenter(mean, delta, eye)[0])(path, deltas)
+    return jax.vmap(lambda mean, delta: retract_root(mean, delta, eye)[0])(path, deltas)
 
 
 def _state(mean: Any, tangent: tuple[Array, Array], step: Array) -> GaussianState:
-    mean, root = recenter(mean, *tangent)
+    mean, root = retract_root(mean, *tangent)
     return GaussianState(mean, root, step)
 
 

@@ -4,6 +4,7 @@ A measurement is a place and the detector's score, one vector: (x, y, z, score) 
 center y, width, height, score) of a box in an image. The state of a target is that and its rates.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Key
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, Sensor
 from jaxloc.poses.lie_group import as_floats
-from jaxloc.tracking import Clutter, Detection, MeasuredBirth, PhdState, Targets, Tracker, TrackerInfo, gmphd
+from jaxloc.tracking import Clutter, Detection, MeasuredBirth, PhdState, Targets, Tracker, TrackerInfo
 
 SOLID, BOX = 4, 5  # entries of a measurement
 LEAST = 0.02  # existence of targets that are looked at
@@ -224,7 +225,7 @@ class WatchedTracker(Tracker):
     def extract(self, state: Any) -> Targets:
         """All targets that are not quite unlikely; those of a PHD filter may share a label."""
         if isinstance(state, PhdState):
-            return gmphd.extract(state.mixture, threshold=LEAST, copies=False)
+            return replace(self.inner, extraction=LEAST).extract(state)
         return self.inner.extract(state)
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 from jaxloc.beliefs import MahalanobisDistance
 from jaxloc.pipelines.detection_tracking.models import LEAST, Noise
 from jaxloc.tracking import (
-    ExistenceLife,
+    ExistenceLogic,
     GlobalNearestNeighbor,
     GmPhd,
     JointProbabilisticDataAssociation,
@@ -56,8 +56,8 @@ class Jpda(Strategy):
 
     def tracker(self, model: TargetModel, capacity: int) -> Tracker:
         """A `JointProbabilisticDataAssociation`, by belief propagation."""
-        life = ExistenceLife(confirm=LEAST, delete=self.delete, show=LEAST)
-        return JointProbabilisticDataAssociation(model, capacity, self.gate, life)
+        logic = ExistenceLogic(confirm=LEAST, delete=self.delete, report=LEAST)
+        return JointProbabilisticDataAssociation(model, capacity, self.gate, logic)
 
 
 class Gnn(Strategy):
@@ -73,8 +73,8 @@ class Gnn(Strategy):
 
     def tracker(self, model: TargetModel, capacity: int) -> Tracker:
         """A `GlobalNearestNeighbor`."""
-        life = ExistenceLife(confirm=LEAST, delete=self.delete, show=LEAST)
-        return GlobalNearestNeighbor(model, capacity, self.gate, life)
+        logic = ExistenceLogic(confirm=LEAST, delete=self.delete, report=LEAST)
+        return GlobalNearestNeighbor(model, capacity, self.gate, logic)
 
 
 STRATEGIES = {"gmphd": Phd, "jpda": Jpda, "gnn": Gnn}

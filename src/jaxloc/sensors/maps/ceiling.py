@@ -1,4 +1,4 @@
-"""One pixel that looks at the ceiling: brightness against a mosaic of the whole ceiling."""
+"""Ceiling brightness sensor: one pixel of an upward camera, with a ceiling mosaic as map."""
 
 import math
 from typing import Any
@@ -12,16 +12,16 @@ from jaxloc.beliefs.models import innovation
 from jaxloc.images.interpolation import Sampled, sample
 from jaxloc.poses import SE2
 
-_ELSEWHERE = -20.0  # log density off the mosaic: no robot is there, but no weight is zero
+_OUTSIDE = -20.0  # log density outside the mosaic: small, but no weight is zero
 
 
 class CeilingMosaic(eqx.Module):
-    """An image of a ceiling, as seen from the floor straight below each point.
+    """A mosaic image of a ceiling, in floor coordinates.
 
     Args:
         brightness: "rows columns" in [0, 1]; columns grow with x, rows with y.
         resolution: edge of a pixel, m.
-        origin: where the center of pixel (0, 0) is, m.
+        origin: position of the center of pixel (0, 0), m.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -46,21 +46,21 @@ class CeilingMosaic(eqx.Module):
         return self.origin + self.resolution * jnp.array([columns - 1, rows - 1], self.origin.dtype)
 
     def at(self, points: Float[Array, "n 2"]) -> Sampled:
-        """Brightness above points of the floor (m), between pixels by both directions; zero off the mosaic."""
+        """Brightness above points of the floor (m), bilinear; zero outside the mosaic."""
         return sample(self.brightness, (points - self.origin[None, :]) / self.resolution)
 
 
 class CeilingSensor(Sensor):
-    """Brightness of the ceiling straight above: ``p(z | x) = (1 - e) N(z; mosaic(x), sigma^2) + e``.
+    """Brightness of the ceiling vertically above the robot: ``p(z | x) = (1 - e) N(z; mosaic(x), sigma^2) + e``.
 
-    A very simple sensor, with one number a reading: no reading tells where the robot is, a hundred do. The uniform part
-    (over brightness from 0 to 1) is for lamps that are off and people in the way.
+    Each reading is one number; only a sequence of readings determines the pose. The uniform part (over brightness from
+    0 to 1) accounts for lamps that are off and occlusions.
 
     Args:
         mosaic: of the ceiling.
-        standard_deviation: of the brightness: noise of the pixel and faults of the mosaic.
-        outlier: part e of readings that the mosaic does not explain.
-        mount: where the camera sits on the robot, m.
+        standard_deviation: of the brightness, from noise of the pixel and errors of the mosaic.
+        outlier: probability e of readings that the mosaic does not explain.
+        mount: position of the camera on the robot, m.
 
     References:
         Dellaert, Burgard, Fox, Thrun, "Using the condensation algorithm for robust, vision-based mobile robot
@@ -97,22 +97,22 @@ class CeilingSensor(Sensor):
 
     def expect(self, state: SE2, measurement: Float[Array, ""]) -> Float[Array, ""]:
         """Brightness of the mosaic above the camera."""
-        return self._look(state).values[0]
+        return self._sample(state).values[0]
 
     def covariance(self, state: SE2, measurement: Float[Array, ""]) -> Float[Array, "1 1"]:
-        """Of readings that the mosaic explains."""
+        """Variance of readings that are not outliers."""
         return (self.standard_deviation**2)[None, None]
 
     def log_prob(self, state: SE2, measurement: Float[Array, ""], valid: Bool[Array, "*m"]) -> Float[Array, ""]:
-        """Log density of a reading; off the mosaic a low constant, so that particles which left it die out."""
-        seen = self._look(state)
+        """Log density of a reading; outside the mosaic a low constant, so that particles there lose their weight."""
+        seen = self._sample(state)
         residual, mask = innovation(seen.values[0], measurement, valid)
         sigma = self.standard_deviation
         normal = -0.5 * (residual[0] / sigma) ** 2 - jnp.log(sigma) - 0.5 * math.log(2.0 * math.pi)
         tiny = float(jnp.finfo(sigma.dtype).tiny)
         explained = normal + jnp.log(jnp.maximum(1.0 - self.outlier, tiny))
         density = jnp.logaddexp(explained, jnp.log(jnp.maximum(self.outlier, tiny)))
-        return jnp.where(mask[0], jnp.where(seen.inside[0], density, _ELSEWHERE), 0.0)
+        return jnp.where(mask[0], jnp.where(seen.inside[0], density, _OUTSIDE), 0.0)
 
-    def _look(self, state: SE2) -> Sampled:
+    def _sample(self, state: SE2) -> Sampled:
         return self.mosaic.at(state.apply(self.mount[None, :]))

@@ -1,4 +1,4 @@
-"""Distance fields: the distance from any point to the nearest obstacle of an occupancy map, differentiable."""
+"""Distance fields of occupancy maps: differentiable distances to the nearest obstacle, and ray casting."""
 
 from typing import Any
 
@@ -12,16 +12,16 @@ from jaxloc.sensors.maps.occupancy_map import OccupancyMap
 
 
 class DistanceField(eqx.Module):
-    """The distance to the nearest obstacle at every cell center, bilinear in between.
+    """A distance field: the distance to the nearest obstacle at every cell center, bilinear in between.
 
-    Outside the grid it goes on from the nearest border value by the distance to the border, up to `ceiling`, so that it
-    is continuous everywhere. Gradients reach the values of the field (the map) and the point.
+    Outside the grid it is the nearest border value plus the distance to the border, up to `ceiling`, so that it is
+    continuous everywhere. It is differentiable in its values (the map) and in the point.
 
     Args:
         distance: "rows columns", m.
         resolution: edge of a cell, m.
         origin: ``T_world_map``.
-        ceiling: the greatest distance that is told apart, m.
+        ceiling: largest distance of the field, m.
 
     References:
         Thrun, Burgard, Fox, *Probabilistic Robotics*, 2005, section 6.4.
@@ -46,9 +46,10 @@ class DistanceField(eqx.Module):
 
         Args:
             grid: the map.
-            surfaces: count only occupied cells beside free ones, so that the inside of a thick wall is far from it,
-                too; where a sensor sees surfaces, this tells where they are to less than the wall is thick.
-            ceiling: distances are cut there, m; rays need the map's size, end points of beams a few sigmas.
+            surfaces: use only occupied cells beside free ones as obstacles, so that distances inside thick walls are
+                not zero and the field locates the surfaces that sensors measure.
+            ceiling: largest distance, m; the size of the map for ray casting, a few standard deviations of a range for
+                end points of beams.
         """
         dtype = grid.resolution.dtype
         ceiling = jnp.asarray(ceiling, dtype)
@@ -57,14 +58,14 @@ class DistanceField(eqx.Module):
         return DistanceField(jnp.minimum(cells * grid.resolution, ceiling), grid.resolution, grid.origin, ceiling)
 
     def to_grid(self, pose: SE2, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> tuple[Array, Array]:
-        """Grid coordinates (column, row) of points in the frame of a pose of the world.
+        """Grid coordinates (column, row) of points in the frame of a pose in the world.
 
-        Map origin, pose and scale are made one similarity first, so that a point costs four products.
+        Map origin, pose and scale are combined to one similarity first, so that a point costs four products.
         """
         local = self.origin.inverse() @ pose
         cos, sin = local.rotation.cos / self.resolution, local.rotation.sin / self.resolution
-        start = local.translation / self.resolution - 0.5
-        return start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)
+        shift = local.translation / self.resolution - 0.5
+        return shift[0] + (cos * x - sin * y), shift[1] + (sin * x + cos * y)
 
     def lookup(self, u: Float[Array, "*n"], v: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Distances (m) at finite grid coordinates (column u, row v), bilinear."""
@@ -83,14 +84,14 @@ class DistanceField(eqx.Module):
         return jnp.minimum(inside + self._beyond(u - u_in, v - v_in), self.ceiling)
 
     def at(self, points: Float[Array, "n 2"]) -> Float[Array, " n"]:
-        """Distances (m) at points of the world (m); a point that is not finite is as far as the ceiling."""
+        """Distances (m) at points of the world (m); the ceiling at non-finite points."""
         finite = jnp.all(jnp.isfinite(points), axis=1)
         safe = jnp.where(finite[:, None], points, 0.0)
         u, v = self.to_grid(SE2.identity(points.dtype), safe[:, 0], safe[:, 1])
         return jnp.where(finite, self.lookup(u, v), self.ceiling)
 
     def _beyond(self, du: Array, dv: Array) -> Array:
-        """How far a point lies outside the rectangle of cell centers, m; its derivative inside is zero, not NaN."""
+        """Distance of a point outside the rectangle of cell centers, m; its derivative inside is zero, not NaN."""
         squared = du**2 + dv**2
         outside = squared > 0.0
         return jnp.where(outside, self.resolution * jnp.sqrt(jnp.where(outside, squared, 1.0)), 0.0)
@@ -102,16 +103,16 @@ def squared_distances(
 ) -> Float[Array, "rows columns"]:
     """Squared Euclidean distance of every cell to the nearest occupied one, in cells; exact.
 
-    First along the columns by running extremes, then along the rows: ``min_k f(x + k) + k^2`` is reached by repeated
-    minima with both neighbors raised by 1, 3, 5, ..., since the first k odd numbers sum to ``k^2``. It stops when
-    nothing changes, after as many rounds as the farthest sideways neighbor needs.
+    First along the columns by cumulative extrema, then along the rows: ``min_k f(x + k) + k^2`` is found by repeated
+    minima with both neighbors plus 1, 3, 5, ..., since the first k odd numbers sum to ``k^2``. It stops when nothing
+    changes.
 
     Args:
         occupied: obstacles.
         dtype: of the result; in float32 distances are exact up to 4096 cells.
 
     Returns:
-        Squared distances; far greater than any in the grid when nothing is occupied.
+        Squared distances; larger than any in the grid when nothing is occupied.
 
     References:
         Huang and Mitchell, "A Euclidean distance transform using grayscale morphology decomposition", PAMI 1994.
@@ -136,8 +137,8 @@ def squared_distances(
         wider = jnp.minimum(values, jnp.minimum(left, right) + (2.0 * step + 1.0))
         return wider, step + 1.0, jnp.any(wider < values)
 
-    start = (squared, jnp.zeros((), dtype), jnp.array(True))
-    return lax.while_loop(lambda carry: carry[2], widen, start)[0]
+    initial = (squared, jnp.zeros((), dtype), jnp.array(True))
+    return lax.while_loop(lambda carry: carry[2], widen, initial)[0]
 
 
 @eqx.filter_jit
@@ -149,17 +150,17 @@ def trace(
     max_range: float | Float[Array, ""],
     num_steps: int = 40,
 ) -> Float[Array, " b"]:
-    """Ranges from a pose to the obstacles of a map, by steps as long as the nearest obstacle is far.
+    """Ray casting by sphere tracing: ranges from a pose to the obstacles of a map.
 
-    A ray ends half a cell short of the center of an obstacle's cell, at its face. After the steps, which carry no
-    derivative, comes one Newton step on ``d(range) = face``, which has the exact derivative of the solution.
+    A ray ends half a cell short of the center of an occupied cell, at its face. After the steps, which carry no
+    derivative, one Newton step on ``d(range) = face`` gives the exact derivative of the solution.
 
     Args:
-        field: of the map; the greater its ceiling, the fewer steps are needed.
+        field: of the map; the larger its ceiling, the fewer steps are needed.
         pose: ``T_world_laser``.
         angles: of the rays in the laser's frame, rad.
-        max_range: where rays end that hit nothing, m.
-        num_steps: fixed; a ray that needs more falls short.
+        max_range: range of rays without an obstacle, m.
+        num_steps: number of steps; rays that need more end short of the obstacle.
 
     Returns:
         Ranges "b", m.
@@ -188,8 +189,7 @@ def trace(
         return jnp.minimum(length + jnp.maximum(gap(fixed, still, length), 0.0), limit)
 
     length = lax.stop_gradient(lax.fori_loop(0, num_steps, advance, jnp.zeros_like(angles)))
-    # How fast the gap closes along the ray, by a difference over a cell: the field has corners that a derivative would
-    # see.
+    # Slope along the ray by a difference over a cell, since the field is not smooth.
     slope = (gap(fixed, still, length) - gap(fixed, still, jnp.maximum(length - face, 0.0))) / face
     refined = length - gap(pose, field, length) / jnp.minimum(slope, -0.1)
     hit = (length < limit) & (gap(fixed, still, length) < face)

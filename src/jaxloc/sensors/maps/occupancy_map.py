@@ -1,4 +1,4 @@
-"""Occupancy grids of the plane."""
+"""Occupancy grid maps and their free space."""
 
 from typing import Any
 
@@ -14,17 +14,17 @@ _GOLDEN = 0.6180339887498949
 
 
 class OccupancyMap(eqx.Module):
-    """A grid of cells, each with the probability that something stands in it.
+    """An occupancy grid: the probability of each cell to be occupied.
 
     Cell (row, column) covers the square whose lower left corner lies at ``origin @ (column, row) * resolution``: rows
-    grow with y. (Image files have their first row at the top; the reader turns them over.)
+    grow with y. (Image files have their first row at the top; the reader flips them.)
 
     Args:
         probability: "rows columns", of being occupied.
         resolution: edge of a cell, m.
         origin: ``T_world_map``, the pose of the lower left corner of cell (0, 0).
-        occupied_above: cells of greater probability are obstacles.
-        free_below: cells of smaller probability are free; those in between are unknown.
+        occupied_above: threshold of occupied cells.
+        free_below: threshold of free cells; those in between are unknown.
 
     References:
         Moravec and Elfes, "High resolution maps from wide angle sonar", ICRA 1985; the ROS ``map_server`` for names.
@@ -60,17 +60,17 @@ class OccupancyMap(eqx.Module):
 
     @property
     def occupied(self) -> Bool[Array, "rows columns"]:
-        """Cells with an obstacle."""
+        """Mask of the occupied cells."""
         return self.probability > self.occupied_above
 
     @property
     def free(self) -> Bool[Array, "rows columns"]:
-        """Cells known to be empty."""
+        """Mask of the free cells."""
         return self.probability < self.free_below
 
     @property
     def surfaces(self) -> Bool[Array, "rows columns"]:
-        """Occupied cells with a free one among the eight around them; all occupied ones where there is none such."""
+        """Occupied cells with a free cell among their eight neighbors; all occupied cells if there is none."""
         padded = jnp.pad(self.free, 1)
         rows, columns = self.free.shape
         beside = jnp.zeros_like(self.free)
@@ -89,19 +89,19 @@ class OccupancyMap(eqx.Module):
         return self.origin.apply((cells + 0.5) * self.resolution)
 
     def free_space(self) -> "FreeSpace":
-        """The free cells, to draw poses from. Lists them on the host: not to be called under `jit`.
+        """The free cells, to sample poses from. They are listed on the host: do not call it under `jit`.
 
         Raises:
             ValueError: no cell is free.
         """
         rows, columns = np.nonzero(np.asarray(self.free))
         if not rows.size:
-            raise ValueError("The map has no free cell: nowhere to start.")
+            raise ValueError("The map has no free cell: there is no free space to sample poses from.")
         return FreeSpace(jnp.asarray(np.stack([columns, rows], 1), jnp.int32), self.resolution, self.origin)
 
 
 class FreeSpace(eqx.Module):
-    """Cells in which a robot may be.
+    """Free cells of a map, to sample poses of a robot from.
 
     Args:
         cells: "k 2" (column, row).
@@ -115,18 +115,18 @@ class FreeSpace(eqx.Module):
 
     @property
     def area(self) -> Float[Array, ""]:
-        """In m^2."""
+        """Area of the free cells, m^2."""
         return self.cells.shape[0] * self.resolution**2
 
-    def spread(self, num_poses: int, *, key: Key[Array, ""]) -> SE2:
-        """Poses spread evenly over the free cells and all headings, with one random shift of the whole pattern.
+    def sample_evenly(self, num_poses: int, *, key: Key[Array, ""]) -> SE2:
+        """Poses evenly distributed over the free cells and all headings, with one random shift of the pattern.
 
-        Even patterns leave no gaps as large as those of independent draws: fewer poses cover a map.
+        Even patterns have smaller gaps than independent samples: fewer poses cover a map.
         """
         shift, within = jax.random.split(key)
         dtype = self.resolution.dtype
         offset = jax.random.uniform(shift, (2,), dtype)
-        # Whole and fractional steps apart: the index stays exact where it exceeds what a 32-bit number can hold.
+        # Integer and fractional steps are kept apart: the products exceed 32-bit precision.
         steps, rest = np.divmod(np.arange(num_poses) * self.cells.shape[0], num_poses)
         width = self.cells.shape[0] / num_poses
         fraction = jnp.asarray(rest / num_poses, dtype) + width * offset[0]

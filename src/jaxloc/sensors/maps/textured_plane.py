@@ -1,4 +1,4 @@
-"""An image painted on a plane of the world: floors, walls and signs as maps of what a camera will see."""
+"""Textured planes (floors, walls, signs) as maps, and their image in a camera."""
 
 from typing import Any
 
@@ -17,8 +17,8 @@ class Predicted(eqx.Module):
     """A predicted image.
 
     Attributes:
-        image: gray levels; zero where the plane is not seen.
-        seen: where it is.
+        image: gray levels; zero where the plane is not visible.
+        seen: mask of the pixels of the plane.
     """
 
     image: Float[Array, "h w"]
@@ -26,10 +26,10 @@ class Predicted(eqx.Module):
 
 
 class TexturedPlane(eqx.Module):
-    """A map image ``Z`` on a plane: the appearance that a pose predicts, ``z(x) = Z(T^-1 x)`` [K-11, K-45].
+    """A plane with an image Z as map; its appearance at a pose is ``z(x) = Z(T^-1 x)`` [K-11, K-45].
 
     The plane's axes lie in it: x along the rows of the image (to the right), y along its columns (down), so that z
-    points away from who looks at it; pixel (0, 0) has its center at the plane's origin.
+    points away from the viewer; pixel (0, 0) has its center at the plane's origin.
 
     Args:
         texture: "rows columns", gray levels.
@@ -58,13 +58,13 @@ class TexturedPlane(eqx.Module):
         return self.T_world_plane.apply(flat)
 
     def homography(self, camera: Pinhole, T_world_camera: SE3) -> Homography:
-        """From pixels of the map to those of a camera without a lens: ``K [r1 r2 t] diag(s, s, 1)`` [K-17].
+        """Homography from pixels of the map to pixels of a camera without a lens: ``K [r1 r2 t] diag(s, s, 1)`` [K-17].
 
         Raises:
-            ValueError: the camera has a lens, which bends straight lines.
+            ValueError: the camera has a lens: straight lines are not preserved.
         """
         if camera.lens is not None:
-            raise ValueError("TexturedPlane.homography: a lens bends lines; undistort the image first.")
+            raise ValueError("TexturedPlane.homography: the camera has a lens; undistort the image first.")
         matrix = (T_world_camera.inverse() @ self.T_world_plane).matrix()
         columns = jnp.stack([self.resolution * matrix[:3, 0], self.resolution * matrix[:3, 1], matrix[:3, 3]], axis=1)
         return Homography.from_matrix(matmul(camera.matrix(), columns))
@@ -78,7 +78,7 @@ class TexturedPlane(eqx.Module):
         shape: tuple[int, int],
         method: AbstractInterpolation = Bilinear(),
     ) -> Predicted:
-        """What a camera sees of the plane, and of nothing else.
+        """The image of the plane in a camera.
 
         Args:
             camera: intrinsics and lens.
@@ -94,7 +94,7 @@ class TexturedPlane(eqx.Module):
         T_plane_camera = self.T_world_plane.inverse() @ T_world_camera
         rays = matmul(jnp.stack([x, y, jnp.ones_like(x)], axis=1), T_plane_camera.rotation.matrix().T)
         center = T_plane_camera.translation
-        # From the camera along the ray to z = 0; rays along or away from the plane do not meet it.
+        # Intersection of the ray with z = 0; rays parallel to or away from the plane have none.
         depth = -center[2]
         meets = rays[:, 2] * depth > 1e-9 * jnp.abs(depth)
         reach = jnp.where(meets, depth / jnp.where(meets, rays[:, 2], 1.0), 0.0)

@@ -1,4 +1,4 @@
-"""Where targets appear: at known places, or wherever something is measured that nothing explains."""
+"""Birth models: new targets at known places, or at unexplained measurements."""
 
 from abc import abstractmethod
 from typing import Any
@@ -13,10 +13,10 @@ from jaxloc.poses.lie_group import as_floats
 
 
 class Birth(eqx.Module):
-    """How new targets enter the belief."""
+    """Interface of birth models; without births by default."""
 
     def mixture(self, example: Any) -> Mixture:
-        """Intensity of births between two scans, which enters with the prediction; nothing by default.
+        """Intensity of births between two scans, added in the prediction; empty by default.
 
         Args:
             example: a state, for its structure.
@@ -24,18 +24,18 @@ class Birth(eqx.Module):
         return Mixture.empty(0, example)
 
     def log_intensity(self, measurement: Any) -> Float[Array, ""] | None:
-        """Log intensity of measurements by targets that are born with them; None where there are none."""
+        """Log intensity of first measurements of new targets; None for models without such births."""
         del measurement
         return None
 
     def seed(self, measurement: Any) -> Gaussian | None:
-        """The state of a target that is born with a measurement, given it; None where there are none."""
+        """Density of a new target given its first measurement; None for models without such births."""
         del measurement
         return None
 
 
 class StaticBirth(Birth):
-    """Targets appear around known places.
+    """Targets appear near known places, with a constant intensity.
 
     Args:
         intensity: their mixture; weights are expected numbers in a scan.
@@ -57,10 +57,10 @@ class StaticBirth(Birth):
 
 
 class MeasuredBirth(Birth):
-    """Targets may appear anywhere that the sensor sees: they are born with their first measurement.
+    """Measurement-driven births, uniform over the measurement space: targets are born with their first measurement.
 
-    As many are expected everywhere in the measurement space. One that is born is measured at once, so that its weight
-    after a scan with clutter and others' explanations of the measurement is exact: ``b / (kappa(z) + b + sum ...)``.
+    A new target is detected with certainty, so that its weight after a scan, relative to clutter and existing targets,
+    is exact: ``b / (kappa(z) + b + sum ...)``.
 
     Args:
         rate: expected number of births in a scan.
@@ -81,11 +81,11 @@ class MeasuredBirth(Birth):
 
     @abstractmethod
     def seed(self, measurement: Any) -> Gaussian:
-        """The state of a new target given its first measurement."""
+        """Density of a new target given its first measurement."""
 
 
 class PointBirth(MeasuredBirth):
-    """For states (position, other entries) of which a sensor measures the position.
+    """Measurement-driven births of states (position, other entries) whose position is measured.
 
     Args:
         rate: expected number of births in a scan.
@@ -110,6 +110,6 @@ class PointBirth(MeasuredBirth):
         self.noise_covariance, self.variances = noise_covariance, variances
 
     def seed(self, measurement: Float[Array, " m"]) -> Gaussian:
-        """The position as measured, all else unknown."""
+        """The measured position, with zero mean for the other entries."""
         mean = jnp.concatenate([measurement, jnp.zeros_like(self.variances)])
         return Gaussian(mean, jax.scipy.linalg.block_diag(self.noise_covariance, jnp.diag(self.variances)))

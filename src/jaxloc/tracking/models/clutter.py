@@ -1,4 +1,4 @@
-"""Measurements that come from no target: how many, and where."""
+"""Clutter models: Poisson processes of false measurements."""
 
 import math
 from abc import abstractmethod
@@ -24,7 +24,7 @@ class Clutter(eqx.Module):
 
     @abstractmethod
     def log_density(self, measurement: Any) -> Float[Array, ""]:
-        """Log density of where one lies, with respect to volume in the tangent space of the measurement."""
+        """Log density of a false measurement, with respect to volume in the tangent space of the measurement."""
 
     def log_intensity(self, measurement: Any) -> Float[Array, ""]:
         """``log kappa(z)``."""
@@ -32,7 +32,7 @@ class Clutter(eqx.Module):
 
 
 class UniformClutter(Clutter):
-    """As many everywhere in the volume that the sensor sees.
+    """Clutter uniform over the measurement space.
 
     Args:
         rate: expected number in a scan.
@@ -61,17 +61,17 @@ class UniformClutter(Clutter):
 
 
 class FrustumClutter(Clutter):
-    """False matches of a stereo camera, uniform in (u_left, u_right, v), as seen in space.
+    """Clutter of a stereo camera: false matches uniform in (u_left, u_right, v), as points in space.
 
-    A point that is triangulated from a false match lies at p with density ``|dh/dp| / V``, h the projection by the rig:
-    dense near the cameras and thin far away, where a pixel is a large volume.
+    A point triangulated from a false match has the density ``|dh/dp| / V`` at p, with h the projection
+    by the rig: high near the cameras and low far away, where a pixel is a large volume.
 
     Args:
         rate: expected number in a scan.
         rig: the cameras; measurements are points in the left one's frame, m.
         width: of the images, px.
         height: of the images, px.
-        nearest: depth that the search for matches begins at, m: it bounds the disparity.
+        nearest: least depth of matches, m; it bounds the disparity.
 
     References:
         T-77; the density is the change of variables of T-22.

@@ -1,4 +1,4 @@
-"""What targets do, and what a sensor sees of them: shared by all trackers."""
+"""The multi-target model that all trackers share: motion, detection, survival, clutter and births."""
 
 from abc import abstractmethod
 from typing import Any
@@ -16,15 +16,15 @@ from jaxloc.tracking.models.clutter import Clutter
 
 
 class Detection(eqx.Module):
-    """How probable it is that a target is measured in a scan."""
+    """Interface of detection probabilities."""
 
     @abstractmethod
     def probability(self, state: Any) -> Float[Array, ""]:
-        """At a state."""
+        """Probability of detection of a target in a state."""
 
 
 class ConstantDetection(Detection):
-    """The same everywhere.
+    """Constant probability of detection.
 
     Args:
         value: p_D.
@@ -42,15 +42,15 @@ class ConstantDetection(Detection):
 
 
 class FieldOfView(Detection):
-    """One probability in the view of a camera, none outside it. States begin with a position in the world.
+    """Probability of detection inside the field of view of a camera, zero outside. States begin with a world position.
 
     Args:
         value: p_D in view.
-        camera: whose view it is.
+        camera: intrinsics.
         pose: ``T_world_camera``.
         size: (width, height) of the image, px.
-        farthest: depth up to which things are seen, m.
-        nearest: depth from which on they are, m.
+        farthest: largest depth of detections, m.
+        nearest: least depth of detections, m.
     """
 
     value: Float[Array, ""]
@@ -78,13 +78,13 @@ class TargetModel(eqx.Module):
     """The assumptions of the standard multi-target model: independent targets, each measured at most once in a scan.
 
     Args:
-        filter: how one target moves and is measured, and how these are linearized: a `KalmanFilter` for linear models,
+        filter: the filter of one target, with motion and sensor model: a `KalmanFilter` for linear models,
             an `ExtendedKalmanFilter` (one iteration) or a `SigmaPointFilter`. Its own gate is not used. Some trackers
             take `InteractingFilters` as well.
         detection: p_D, a number or a `Detection`.
-        survival: p_S, probability that a target is still there at the next scan.
-        clutter: what is measured of no target.
-        birth: where targets appear.
+        survival: p_S, probability that a target exists at the next scan.
+        clutter: false measurements.
+        birth: new targets.
 
     References:
         Mahler, "Multitarget Bayes filtering via first-order multitarget moments", IEEE TAES 2003 [T-62], [T-74].
