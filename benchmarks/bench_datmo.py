@@ -36,7 +36,7 @@ def _highway() -> Iterator[Metric]:
     with (_CLIPS / "moving_cars_01.csv").open() as file:
         labels = list(csv.DictReader(file))
     sequence = jl.data.kitti.read_sequence(_CLIPS / "sequences" / "01")
-    steps = list(moving_objects.steps(list(sequence), sequence.rig))
+    steps = list(moving_objects.run(list(sequence), moving_objects.Config(), sequence.rig))
     hits: dict[str, list[bool]] = {}
     speeds = []
     for row in labels:
@@ -54,14 +54,14 @@ def _highway() -> Iterator[Metric]:
 def _standing_street() -> Iterator[Metric]:
     """KITTI 06: nothing moves."""
     sequence = jl.data.kitti.read_sequence(_CLIPS / "sequences" / "06")
-    steps = list(moving_objects.steps(list(sequence), sequence.rig))
+    steps = list(moving_objects.run(list(sequence), moving_objects.Config(), sequence.rig))
     false = {track.label for step in steps for track in step.tracks}
     rate = 10.0 * len(false) / len(steps)
     yield Metric("datmo.kitti_06.false_tracks", rate, "per 10 frames", "lower", ACCURACY)
     yield from _times("datmo.kitti_06", steps)
 
 
-def _times(key: str, steps: list[moving_objects.Step]) -> Iterator[Metric]:
+def _times(key: str, steps: list[moving_objects.Output]) -> Iterator[Metric]:
     stages = {name: [step.timings[name] for step in steps[_WARM_UP:]] for name in steps[-1].timings}
     for name, seconds in stages.items():
         yield Metric(f"{key}.stage.{name}", 1e3 * float(np.median(seconds)), "ms")
@@ -76,8 +76,8 @@ def _rendered(num_frames: int, detectors: tuple[str, ...]) -> Iterator[Metric]:
     truth = [_visible(street, i) for i in range(num_frames)]
     for name in detectors:
         config = odometry.Config(detector=_DETECTORS[name])
-        evidence = list(odometry.steps_with_evidence(frames, street.rig, config))
-        steps = list(moving_objects.follow(evidence, street.rig, moving_objects.Config(odometry=config)))
+        evidence = list(odometry.run_with_evidence(frames, config, street.rig))
+        steps = list(moving_objects.run_after_odometry(evidence, moving_objects.Config(odometry=config), street.rig))
         key = f"datmo.table_2.{name}"
         found, squared = _compare(steps, truth)
         yield Metric(f"{key}.missed", 100.0 * (1.0 - found), "% of visible", "lower", ACCURACY)
@@ -94,7 +94,9 @@ def _rendered(num_frames: int, detectors: tuple[str, ...]) -> Iterator[Metric]:
         for threshold in _THRESHOLDS:
             merge = jl.beliefs.KullbackLeibler(threshold)
             steps = list(
-                moving_objects.follow(evidence, street.rig, moving_objects.Config(odometry=config, merge=merge))
+                moving_objects.run_after_odometry(
+                    evidence, moving_objects.Config(odometry=config, merge=merge), street.rig
+                )
             )
             key = f"datmo.table_1.{name}.{threshold:g}_nats".replace("0.1", "01")
             yield Metric(f"{key}.missed", 100.0 * (1.0 - _compare(steps, truth)[0]), "% of visible", "lower", ACCURACY)
@@ -121,7 +123,7 @@ def _visible(street: Any, index: int) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _compare(
-    steps: list[moving_objects.Step], truth: list[list[tuple[np.ndarray, np.ndarray]]]
+    steps: list[moving_objects.Output], truth: list[list[tuple[np.ndarray, np.ndarray]]]
 ) -> tuple[float, np.ndarray]:
     """Share of the visible objects that a track is at, and squared position errors in sigmas of these."""
     hits, squared = [], []

@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 
 import jaxloc as jl
 from benchmarks.metric import ACCURACY, REPOSITORY, TIME, Metric
-from jaxloc.data.tracking import KittiTracking, LabelledTracks
+from jaxloc.data.tracking import KittiTracking, LabeledTracks
 from jaxloc.evaluation import consistency
 from jaxloc.evaluation.targets.mot_metrics import BoxOverlap, Comparison, PointDistance, clear_mot, compare, hota, id_f1
 
@@ -205,7 +205,7 @@ def _mot(folder: Path) -> Iterator[Metric]:
         yield Metric(f"{key}.idf1", id_f1(pairs).f1, "", "higher", watched)
 
 
-def _overlaps(truth: LabelledTracks, tracked: Any) -> Comparison:
+def _overlaps(truth: LabeledTracks, tracked: Any) -> Comparison:
     center, sides = tracked.places[..., :2], tracked.places[..., 2:]
     boxes = np.concatenate([center - 0.5 * sides, center + 0.5 * sides], axis=2)
     there = truth.detections

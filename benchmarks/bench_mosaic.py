@@ -22,7 +22,7 @@ def metrics(smoke: bool) -> Iterator[Metric]:
     drive = floor.drive_loop(num_frames=frames, step=0.008 if smoke else 0.025, camera=camera)
     built, taken = timed(
         lambda: floor_mosaic.make_mosaic(
-            drive.frames, drive.odometry, camera.ground, covariances=drive.covariances, start=drive.poses[0]
+            drive.frames, drive.odometry, camera.ground, covariances=drive.covariances, initial=drive.poses[0]
         )
     )
     pixel = float(built.mosaic.raster.resolution)

@@ -133,7 +133,7 @@ def _street(num_frames: int) -> Iterator[Metric]:
 
 def _pipeline(frames: list[jl.data.StereoFrame], rig: jl.sensors.StereoRig) -> np.ndarray:
     odometry = jl.pipelines.odometry
-    return np.stack([np.asarray(step.pose.matrix()) for step in odometry.steps(frames, rig, odometry.Config())])
+    return np.stack([np.asarray(step.pose.matrix()) for step in odometry.run(frames, odometry.Config(), rig)])
 
 
 def _opencv_pipeline(frames: list[jl.data.StereoFrame], rig: jl.sensors.StereoRig) -> np.ndarray:

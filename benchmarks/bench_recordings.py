@@ -27,8 +27,8 @@ def _clip(name: str, folder: Path, smoke: bool) -> Iterator[Metric]:
     sequence = jl.data.kitti.read_sequence(folder, None)
     frames = [sequence[i] for i in range(5 if smoke else len(sequence))]
     key, config = f"recordings.kitti_{name}", odometry.Config()
-    list(odometry.steps(frames[:3], sequence.rig, config))  # compiles
-    steps = list(odometry.steps(frames, sequence.rig, config))
+    list(odometry.run(frames[:3], config, sequence.rig))  # compiles
+    steps = list(odometry.run(frames, config, sequence.rig))
     yield from _accuracy(key, steps, sequence.truth)
     stages = {stage: [step.timings[stage] for step in steps[1:]] for stage in steps[-1].timings}
     for stage, seconds in stages.items():
@@ -38,7 +38,7 @@ def _clip(name: str, folder: Path, smoke: bool) -> Iterator[Metric]:
     offset = float(odometry.calibrate_disparity(frames[:20], sequence.rig, config).mean[0])
     yield Metric(f"{key}.disparity_offset", offset, "px", "equal", ACCURACY)
     mended = odometry.Config(matching=jl.odometry.MatchingOptions(disparity_offset=offset))
-    yield from _accuracy(f"{key}.calibrated", list(odometry.steps(frames, sequence.rig, mended)), sequence.truth)
+    yield from _accuracy(f"{key}.calibrated", list(odometry.run(frames, mended, sequence.rig)), sequence.truth)
 
 
 def _accuracy(key: str, steps: list, truth: jl.poses.Trajectory) -> Iterator[Metric]:

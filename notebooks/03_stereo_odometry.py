@@ -86,7 +86,7 @@ jl.evaluation.plots.trajectories.draw_trajectory(path, drive.truth)
 # covariance each. It yields one step a frame, as frames come.
 
 # %%
-steps = list(jl.pipelines.odometry.steps(street, street.rig, jl.pipelines.odometry.Config()))
+steps = list(jl.pipelines.odometry.run(street, jl.pipelines.odometry.Config(), street.rig))
 estimate = jl.poses.Trajectory.from_matrices(
     street.truth.times, jnp.stack([step.pose.matrix() for step in steps]).astype(street.truth.times.dtype)
 )

@@ -48,7 +48,7 @@ config = jl.pipelines.localization.Config(
     num_particles=300 if FAST else 1000, num_particles_global=1000 if FAST else 10_000
 )
 steps = []
-for step in jl.pipelines.localization.steps(log, grid, config=config):
+for step in jl.pipelines.localization.run(log, config, grid):
     steps.append(step)
     if len(steps) == count:
         break

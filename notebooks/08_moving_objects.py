@@ -27,7 +27,7 @@ plt.rcParams["figure.dpi"] = 70
 # %%
 street = jl.data.simulate_street(num_frames=18 if FAST else 60, seed=0)
 frames = list(street)
-evidence = list(jl.pipelines.odometry.steps_with_evidence(frames, street.rig))
+evidence = list(jl.pipelines.odometry.run_with_evidence(frames, jl.pipelines.odometry.Config(), street.rig))
 step, found = evidence[16]
 points = jl.odometry.find_moving(
     street.rig, found.reference, found.current, found.matches, found.motion, jnp.array(0.1, jnp.float32)
@@ -62,7 +62,7 @@ for i in np.flatnonzero(objects.valid):
 # The filter knows where the camera is, how surely, and what it can see from there: an object out of view is not missed.
 
 # %%
-steps = list(moving_objects.follow(evidence, street.rig))
+steps = list(moving_objects.run_after_odometry(evidence, moving_objects.Config(), street.rig))
 figure, axes = plt.subplots(figsize=(5, 6))
 camera = np.array([np.asarray(one.odometry.pose.translation) for one in steps])
 axes.plot(camera[:, 0], camera[:, 2], "k", label="camera")

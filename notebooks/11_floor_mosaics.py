@@ -37,7 +37,7 @@ plt.show()
 
 # %%
 built = floor_mosaic.make_mosaic(
-    trip.frames, trip.odometry, camera.ground, covariances=trip.covariances, start=trip.poses[0]
+    trip.frames, trip.odometry, camera.ground, covariances=trip.covariances, initial=trip.poses[0]
 )
 pixel = float(built.mosaic.raster.resolution)
 

@@ -1,6 +1,7 @@
-"""The whole odometry, on the synthetic street and on KITTI clips: T-68...T-71, K-86, K-87."""
+"""Stereo odometry on the synthetic street and on KITTI clips: T-68...T-71, K-86, K-87."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from jaxloc.pipelines import odometry
 pytestmark = pytest.mark.heavy
 
 
-def matrices(steps):
-    return np.stack([np.asarray(step.pose.matrix(), np.float64) for step in steps])
+def matrices(outs):
+    return np.stack([np.asarray(out.pose.matrix(), np.float64) for out in outs])
 
 
 def relative(poses):
@@ -38,24 +39,24 @@ def street():
     return sequence, np.asarray(sequence.truth.matrices(), np.float64)
 
 
-def test_street_is_followed_within_a_millimeter_a_meter(street):
+def test_drift_on_the_street_is_below_three_thousandths(street):
     sequence, truth = street
-    steps = list(odometry.steps(sequence, sequence.rig))
-    assert all(step.ok for step in steps)
-    assert drift_percent(matrices(steps), truth) < 0.3
-    assert steps[0].num_matches == 0 and not steps[0].covariance.any()
-    traces = [np.trace(step.covariance) for step in steps]
+    outs = list(odometry.run(sequence, odometry.Config(), sequence.rig))
+    assert all(out.ok for out in outs)
+    assert drift_percent(matrices(outs), truth) < 0.3
+    assert outs[0].num_matches == 0 and not outs[0].covariance.any()
+    traces = [np.trace(out.covariance) for out in outs]
     assert (np.diff(traces) > 0).all()
 
 
-def test_keyframes_that_live_longer_give_the_same_path(street):
+def test_older_keyframes_give_the_same_path(street):
     sequence, truth = street
     config = odometry.Config(keyframe_frames=3)
-    steps = list(odometry.steps(sequence, sequence.rig, config))
-    assert all(step.ok for step in steps)
-    assert drift_percent(matrices(steps), truth) < 0.3
-    motions = np.stack([np.asarray(step.relative.matrix(), np.float64) for step in steps[1:]])
-    assert np.allclose(motions, relative(matrices(steps)), atol=1e-4)
+    outs = list(odometry.run(sequence, config, sequence.rig))
+    assert all(out.ok for out in outs)
+    assert drift_percent(matrices(outs), truth) < 0.3
+    motions = np.stack([np.asarray(out.relative.matrix(), np.float64) for out in outs[1:]])
+    assert np.allclose(motions, relative(matrices(outs)), atol=1e-4)
 
 
 def test_dark_frames_are_predicted_with_grown_covariance_and_then_bridged(street):
@@ -65,59 +66,86 @@ def test_dark_frames_are_predicted_with_grown_covariance_and_then_bridged(street
         frames[i] = dataclasses.replace(
             frames[i], left=np.zeros_like(frames[i].left), right=np.zeros_like(frames[i].right)
         )
-    steps = list(odometry.steps(frames, sequence.rig))
-    assert [step.ok for step in steps] == [i not in (5, 6) for i in range(len(steps))]
-    assert np.trace(steps[5].covariance) > 100 * np.trace(steps[4].covariance)
-    assert np.trace(steps[7].covariance) < 0.1 * np.trace(steps[6].covariance)
-    assert drift_percent(matrices(steps), truth) < 1.0
-    assert all(np.isfinite(step.covariance).all() for step in steps)
+    outs = list(odometry.run(frames, odometry.Config(), sequence.rig))
+    assert [out.ok for out in outs] == [i not in (5, 6) for i in range(len(outs))]
+    assert np.trace(outs[5].covariance) > 100 * np.trace(outs[4].covariance)
+    assert np.trace(outs[7].covariance) < 0.1 * np.trace(outs[6].covariance)
+    assert drift_percent(matrices(outs), truth) < 1.0
+    assert all(np.isfinite(out.covariance).all() for out in outs)
 
 
 def test_a_recording_that_stays_dark_still_gives_poses(street):
     sequence, _ = street
     frame = sequence[0]
     dark = [dataclasses.replace(frame, left=np.zeros_like(frame.left), right=np.zeros_like(frame.right))] * 3
-    steps = list(odometry.steps(dark, sequence.rig))
-    assert [step.ok for step in steps] == [True, False, False]
-    assert np.isfinite(matrices(steps)).all()
+    outs = list(odometry.run(dark, odometry.Config(), sequence.rig))
+    assert [out.ok for out in outs] == [True, False, False]
+    assert np.isfinite(matrices(outs)).all()
     with pytest.raises(ValueError, match="No motion"):
         odometry.calibrate_disparity(dark, sequence.rig)
 
 
-def test_disparity_is_found_to_be_calibrated_on_the_street(street):
+def test_the_disparity_offset_of_the_street_is_zero(street):
     sequence, _ = street
     offset = odometry.calibrate_disparity([sequence[i] for i in range(8)], sequence.rig)
     assert abs(float(offset.mean[0])) < 0.1
+
+
+def test_a_restored_run_gives_the_same_numbers(street, check_resumed):
+    sequence, _ = street
+    frames = [sequence[i] for i in range(6)]
+    config = odometry.Config(keyframe_frames=3)
+    outs, _ = check_resumed(lambda: odometry.init(config, sequence.rig), odometry.step, frames, 3)
+    for one, other in zip(outs, odometry.run(frames, config, sequence.rig), strict=True):
+        np.testing.assert_array_equal(one.pose.matrix(), other.pose.matrix())
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def test_images_that_cannot_be_used_are_refused(street):
+    sequence, _ = street
+    frame = sequence[0]
+    state = odometry.init(odometry.Config(), sequence.rig)
+
+    def refuse(match, state=state, **images):
+        with pytest.raises(ValueError, match=match):
+            odometry.step(state, types.SimpleNamespace(**vars(frame) | images))
+
+    refuse("left image has shape .* not a color image", left=np.stack([frame.left] * 3, axis=2))
+    refuse("right image is missing", right=None)
+    refuse("right image has dtype uint16", right=frame.right.astype(np.uint16))
+    refuse("right image has shape", right=frame.right[:, 1:])
+    state, _ = odometry.step(state, frame)
+    refuse("left image has shape .* start anew with init", state, left=frame.left[1:], right=frame.right[1:])
 
 
 @pytest.mark.recordings
 def test_kitti_06_drifts_less_than_one_percent(recordings):
     sequence = kitti.read_sequence(recordings / "kitti_odometry/sequences/06", None)
     truth = np.asarray(sequence.truth.matrices(), np.float64)
-    steps = list(odometry.steps(sequence, sequence.rig))
+    outs = list(odometry.run(sequence, odometry.Config(), sequence.rig))
     errors = [
         angle_deg((np.linalg.inv(a) @ b)[:3, :3])
-        for a, b in zip(relative(truth), relative(matrices(steps)), strict=True)
+        for a, b in zip(relative(truth), relative(matrices(outs)), strict=True)
     ]
-    assert all(step.ok for step in steps)
-    assert drift_percent(matrices(steps), truth) < 1.0
+    assert all(out.ok for out in outs)
+    assert drift_percent(matrices(outs), truth) < 1.0
     assert np.median(errors) < 0.035
 
 
 @pytest.mark.recordings
 def test_kitti_01_among_moving_cars(recordings):
-    """Rotation as good as its own truth; the clip's disparities are too small, which calibration notices and mends."""
+    """Rotation within the accuracy of the truth; the clip's disparities are too small, which calibration corrects."""
     sequence = kitti.read_sequence(recordings / "kitti_odometry/sequences/01", None)
     truth = np.asarray(sequence.truth.matrices(), np.float64)
-    steps = list(odometry.steps(sequence, sequence.rig))
+    outs = list(odometry.run(sequence, odometry.Config(), sequence.rig))
     errors = [
         angle_deg((np.linalg.inv(a) @ b)[:3, :3])
-        for a, b in zip(relative(truth), relative(matrices(steps)), strict=True)
+        for a, b in zip(relative(truth), relative(matrices(outs)), strict=True)
     ]
     assert np.median(errors) < 0.041
     offset = float(odometry.calibrate_disparity([sequence[i] for i in range(12)], sequence.rig).mean[0])
     assert 0.4 < offset < 1.25
-    mended = list(
-        odometry.steps(sequence, sequence.rig, odometry.Config(matching=MatchingOptions(disparity_offset=offset)))
+    corrected = list(
+        odometry.run(sequence, odometry.Config(matching=MatchingOptions(disparity_offset=offset)), sequence.rig)
     )
-    assert drift_percent(matrices(mended), truth) < 0.5 * drift_percent(matrices(steps), truth)
+    assert drift_percent(matrices(corrected), truth) < 0.5 * drift_percent(matrices(outs), truth)

@@ -1,4 +1,4 @@
-"""The command line: arguments in, pipelines run, reports out.
+"""Command line: each command runs a pipeline on files and writes results and a report.
 
 Bad input ends with one line on stderr, ``jaxloc: error: <file>: <what>``, and exit code 2; an interrupt with 130.
 """
@@ -36,7 +36,7 @@ def run(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         return _INTERRUPTED
     except BrokenPipeError:
-        # The reader of our output left, as `head` does: say nothing more.
+        # The reader of the output closed it, as `head` does: print nothing more.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
@@ -49,7 +49,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _describe(error: Exception) -> str | None:
-    """The line that explains bad input, or None when the error is ours."""
+    """The line that explains bad input, or None when the error is a bug."""
     if hasattr(error, "format_message"):  # an argument that the command line parser refused
         return error.format_message()
     if isinstance(error, OSError) and error.filename is not None:

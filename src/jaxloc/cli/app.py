@@ -1,7 +1,7 @@
-"""The commands and their arguments. Everything heavy is imported when a command runs, so that help is quick."""
+"""Commands and their arguments. Heavy modules are imported when a command runs, so that help is quick."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -20,6 +20,41 @@ _Config = Annotated[
     Path | None,
     typer.Option("--config", metavar="FILE", help="YAML file with options, such as an earlier config.yaml."),
 ]
+_Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="An option, such as motion.pitch=0.01; may be repeated."),
+]
+
+
+_SHOW_HELP = "Print the default options as YAML and leave."
+
+
+def _print_defaults(name: str) -> None:
+    """Prints the default options of a command as YAML."""
+    from importlib import import_module
+
+    from jaxloc.cli import options
+
+    command = import_module(f"jaxloc.cli.{name}.command")
+    typer.echo(options.format_options(command.default_config()), nl=False)
+
+
+def _show_option(name: str) -> Any:
+    """The option that prints a command's default options and leaves, whatever else is given."""
+
+    def show(wanted: bool) -> bool:
+        if wanted:
+            _print_defaults(name)
+            raise typer.Exit()
+        return wanted
+
+    return typer.Option("--show-config", callback=show, is_eager=True, help=_SHOW_HELP)
+
+
+def _arguments(out: Path, config: Path | None, settings: list[str] | None) -> Any:
+    from jaxloc.cli.lifecycle import Arguments
+
+    return Arguments(out, config, tuple(settings or ()))
 
 
 def _show_version(wanted: bool) -> bool:
@@ -48,6 +83,8 @@ def odometry(
     ] = None,
     out: _Out = Path("out"),
     config: _Config = None,
+    settings: _Set = None,
+    show_config: Annotated[bool, _show_option("odometry")] = False,
 ) -> int:
     """Estimate the path of a stereo camera, with covariances.
 
@@ -56,20 +93,22 @@ def odometry(
     """
     from jaxloc.cli.odometry import command
 
-    return command.run_recording(sequence, poses, out, config)
+    return command.run_recording(sequence, poses, _arguments(out, config, settings))
 
 
 @app.command()
 def demo(
     out: _Out = Path("jaxloc_demo"),
     config: _Config = None,
+    settings: _Set = None,
+    show_config: Annotated[bool, _show_option("odometry")] = False,
     frames: Annotated[int, typer.Option(min=2, help="Number of stereo frames.")] = 60,
-    seed: Annotated[int, typer.Option(min=0, help="Which street.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the street.")] = 0,
 ) -> int:
-    """Drive along a synthetic street, find the path and what moves, and write reports: no data needed."""
+    """Run stereo odometry and tracking of moving objects on a synthetic street: no data needed."""
     from jaxloc.cli.odometry import command
 
-    return command.run_demo(out, config, num_frames=frames, seed=seed)
+    return command.run_demo(_arguments(out, config, settings), num_frames=frames, seed=seed)
 
 
 @app.command()
@@ -88,14 +127,16 @@ def localize(
     ] = None,
     out: _Out = Path("out"),
     config: _Config = None,
+    settings: _Set = None,
+    show_config: Annotated[bool, _show_option("localize")] = False,
 ) -> int:
-    """Find a robot in a map by its laser, and follow it.
+    """Localize a robot in a map by its laser scans.
 
     Writes trajectory.tum (times of the log, frame of the map), spread.csv, metrics.json, report.html and config.yaml.
     """
     from jaxloc.cli.localize import command
 
-    return command.run_log(log, map_path, start, reference, out, config)
+    return command.run_log(log, map_path, start, reference, _arguments(out, config, settings))
 
 
 @app.command()
@@ -105,7 +146,9 @@ def track(
     ] = None,
     detections: Annotated[
         Path | None,
-        typer.Option("--detections", metavar="FILE", help="Ready detections, in place of a SEQUENCE: KITTI or MOT."),
+        typer.Option(
+            "--detections", metavar="FILE", help="Detections of any detector, in place of a SEQUENCE: KITTI or MOT."
+        ),
     ] = None,
     poses: Annotated[
         Path | None, typer.Option("--poses", metavar="FILE", help="Camera poses as KITTI rows, camera to world.")
@@ -125,13 +168,20 @@ def track(
     ] = None,
     out: _Out = Path("out"),
     config: _Config = None,
+    settings: _Set = None,
+    show_config: Annotated[
+        bool, typer.Option("--show-config", help="Print the default options as YAML and leave.")
+    ] = False,
 ) -> int:
-    """Track what moves: from a stereo camera, or from the detections of any detector.
+    """Track moving objects seen by a stereo camera, or the detections of any detector.
 
     Writes tracks.csv, metrics.json, report.html and config.yaml; of detections also tracks_mot.txt (frames from 1), of
     a stereo camera also trajectory.txt and images. Rows of tracks.csv are in m in the frame of the first camera; of
     MOT detections they are of the center of the box in px, and z, vz and var_z are empty.
     """
+    if show_config:
+        _print_defaults("track.stereo" if detections is None else "track.detections")
+        return 0
     if (sequence is None) == (detections is None):
         raise typer.BadParameter("give either a SEQUENCE or --detections FILE")
     if detections is None:
@@ -139,13 +189,14 @@ def track(
             raise typer.BadParameter("--calib, --format, --tracker and --truth go with --detections")
         from jaxloc.cli.track.stereo import command
 
-        return command.run_recording(sequence, poses, out, config)
+        return command.run_recording(sequence, poses, _arguments(out, config, settings))
     from jaxloc.cli.track.detections import command
 
     for name, value, known in (("--format", form, command.FORMATS), ("--tracker", tracker, command.TRACKERS)):
         if value not in known:
             raise typer.BadParameter(f"{name} is {value!r}, must be one of {', '.join(known)}")
-    return command.run_detections(command.Inputs(detections, form, poses, calib, truth, tracker), out, config)
+    inputs = command.Inputs(detections, form, poses, calib, truth, tracker)
+    return command.run_detections(inputs, _arguments(out, config, settings))
 
 
 @app.command()
@@ -155,20 +206,20 @@ def lane(
         Path,
         typer.Option("--camera", metavar="CAMERA.yaml", help="OpenCV's camera file, plus height_m (pitch_rad)."),
     ],
-    speed: Annotated[
-        float, typer.Option("--speed", metavar="M/S", min=0.0, help="Of the vehicle: how far ahead to look.")
-    ] = 20.0,
+    speed: Annotated[float, typer.Option("--speed", metavar="M/S", min=0.0, help="Of the vehicle.")] = 20.0,
     out: _Out = Path("out"),
     config: _Config = None,
+    settings: _Set = None,
+    show_config: Annotated[bool, _show_option("lane")] = False,
 ) -> int:
-    """Find where in its lane a vehicle is, and how the lane bends.
+    """Estimate the position and heading of a vehicle in its lane, and the lane's curvature.
 
     Writes lane.csv (m left of the lane's center, rad, 1/m), borders.csv (columns of the lane's borders in the image),
     annotated images or a video, metrics.json, report.html and config.yaml.
     """
     from jaxloc.cli.lane import command
 
-    return command.run_recording(path, camera, speed, out, config)
+    return command.run_recording(path, camera, speed, _arguments(out, config, settings))
 
 
 @app.command()
@@ -182,15 +233,17 @@ def calibrate(
     ] = None,
     out: _Out = Path("out"),
     config: _Config = None,
+    settings: _Set = None,
+    show_config: Annotated[bool, _show_option("calibrate")] = False,
 ) -> int:
-    """Find focal lengths, principal point and lens of a camera, or of two, from images of a chessboard.
+    """Calibrate a camera, or a stereo rig, from images of a chessboard.
 
     Writes camera.yaml (OpenCV's format, with the parameters' covariance), of two cameras also right.yaml and
     stereo.yaml (with rectification), corners.csv, metrics.json, report.html and config.yaml.
     """
     from jaxloc.cli.calibrate import command
 
-    return command.run_images(images, right, (grid, square), out, config)
+    return command.run_images(images, right, (grid, square), _arguments(out, config, settings))
 
 
 @app.command()
@@ -206,11 +259,13 @@ def mosaic(
     ],
     out: _Out = Path("out"),
     config: _Config = None,
+    settings: _Set = None,
+    show_config: Annotated[bool, _show_option("mosaic")] = False,
 ) -> int:
-    """Join images of a floor to one map, to be localized in later.
+    """Make a mosaic of a floor from images and odometry.
 
     Writes mosaic.png, mosaic.yaml (resolution and origin), trajectory.tum, metrics.json, report.html and config.yaml.
     """
     from jaxloc.cli.mosaic import command
 
-    return command.run_frames(frames, odometry, camera, out, config)
+    return command.run_frames(frames, odometry, camera, _arguments(out, config, settings))

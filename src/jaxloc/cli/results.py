@@ -1,4 +1,4 @@
-"""What every command leaves behind: the options it ran with, numbers, and a page."""
+"""Results of every command: ``config.yaml``, ``metrics.json`` and ``report.html``."""
 
 import json
 import math
@@ -6,26 +6,33 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import jaxloc
-from jaxloc.cli import configuration, session
+from jaxloc.cli import options
+from jaxloc.cli.yaml_file import load_yaml
 from jaxloc.data.io.writing import write_file
 from jaxloc.evaluation import report
 
 
 @runtime_checkable
 class Record(Protocol):
-    """What a run says of itself."""
+    """Results of a run: metrics and report.
+
+    Attributes:
+        interrupted: whether the run ended early.
+    """
+
+    interrupted: bool
 
     def metrics(self) -> dict[str, Any]:
-        """Numbers, fit for JSON."""
+        """Numbers for ``metrics.json``."""
         ...
 
     def page(self, metrics: dict[str, Any]) -> str:
-        """The report."""
+        """The report as HTML."""
         ...
 
 
 def check_extras() -> None:
-    """Checks that the libraries of the report are there.
+    """Checks that the libraries of the report are installed.
 
     Raises:
         ImportError: when one is not, with what to do.
@@ -36,19 +43,6 @@ def check_extras() -> None:
         import rich  # noqa: F401
     except ImportError as error:
         raise ImportError(f'reports need {error.name}: pip install "jaxloc[cli]"') from error
-
-
-def prepare(out: Path) -> None:
-    """Checks all that can fail before any input is read: the output folder, and the libraries for the results.
-
-    Raises:
-        DataError: when the folder cannot be used.
-        ImportError: when a library is not there.
-    """
-    session.check_output(out)
-    check_extras()
-    configuration.load_yaml()
-    session.keep_compilations()
 
 
 def write(record: Record, config: Any, out: Path, inputs: dict[str, Any]) -> dict[str, Any]:
@@ -66,9 +60,8 @@ def write(record: Record, config: Any, out: Path, inputs: dict[str, Any]) -> dic
     Raises:
         DataError: when a file cannot be written.
     """
-    yaml = configuration.load_yaml()
-    settings = {"jaxloc": jaxloc.__version__, **inputs, "config": configuration.to_plain(config)}
-    write_file(out / "config.yaml", yaml.safe_dump(settings, sort_keys=False))
+    settings = {"jaxloc": jaxloc.__version__, **inputs, "config": options.to_plain(config)}
+    write_file(out / "config.yaml", load_yaml().safe_dump(settings, sort_keys=False))
     metrics = record.metrics()
     write_file(out / "metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n")
     write_file(out / "report.html", record.page(metrics))
@@ -76,7 +69,7 @@ def write(record: Record, config: Any, out: Path, inputs: dict[str, Any]) -> dic
 
 
 def finite(value: Any) -> Any:
-    """JSON has no infinity and no NaN: null stands for them."""
+    """Numbers for JSON: None in place of infinity and NaN."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -95,3 +88,19 @@ def _format(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(_format(item) for item in value)
     return f"{value:.4g}" if isinstance(value, float) and value < 1e4 else str(value)
+
+
+def highlights(metrics: dict[str, Any], wanted: tuple[tuple[str, str, str], ...]) -> tuple[report.Highlight, ...]:
+    """The most important metrics, for the top of the report.
+
+    Args:
+        metrics: of the run.
+        wanted: name, label and format of each; those that are None or absent are left out.
+    """
+    found = [(label, form.format(metrics[name])) for name, label, form in wanted if metrics.get(name) is not None]
+    return tuple(report.Highlight(label, value) for label, value in found)
+
+
+def numbers_section(metrics: dict[str, Any]) -> report.Section:
+    """The section of the report with all metrics."""
+    return report.Section("Numbers", "SI units, or the unit in the name.", table=table(metrics))

@@ -1,4 +1,4 @@
-"""What surrounds a long run: a progress bar, an orderly end on Ctrl-C, kept compilations, a checked output folder."""
+"""Progress bar, orderly end on Ctrl-C, compilation cache, and output folder of a run."""
 
 import os
 import signal
@@ -42,8 +42,8 @@ def show_progress(title: str, total: int) -> Iterator[Callable[[int], None]]:
     """Shows a progress bar on stderr while its block runs.
 
     Args:
-        title: what is being done.
-        total: how many items there are.
+        title: of the bar.
+        total: number of items.
 
     Yields:
         A function to be called with the number of items done.
@@ -60,7 +60,7 @@ def show_progress(title: str, total: int) -> Iterator[Callable[[int], None]]:
 
 @contextmanager
 def output_folder(path: Path) -> Iterator[Path]:
-    """Makes the folder for the results; one that was made here and is still empty after an error goes away again.
+    """Makes the folder for the results; one that was made here and is still empty after an error is removed.
 
     Args:
         path: the folder.

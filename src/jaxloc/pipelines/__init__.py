@@ -1,7 +1,12 @@
-"""Complete systems: recordings in, results out."""
+"""Complete systems over recordings or live input.
+
+`state = init(config, ...)` and `state, output = step(state, input)` are the verbs of every pipeline;
+`run(source, config, ...)` yields the output of each step; `checkpoint` saves a state and restores it.
+"""
 
 from jaxloc.pipelines import (
     calibration,
+    checkpoint,
     detection_tracking,
     floor_mosaic,
     lane_following,
@@ -12,6 +17,7 @@ from jaxloc.pipelines import (
 
 __all__ = [
     "calibration",
+    "checkpoint",
     "detection_tracking",
     "floor_mosaic",
     "lane_following",

@@ -1,4 +1,4 @@
-"""Corners of a chessboard in; a calibrated camera, or a calibrated and rectified pair, out. In float64, on the host."""
+"""Calibration of a camera, or of a stereo rig with its rectification, from corners of a chessboard; in float64."""
 
 from typing import Any
 
@@ -25,15 +25,15 @@ from jaxloc.solvers import Estimate, Huber, Quadratic
 
 
 class Config(eqx.Module):
-    """What is looked for.
+    """Options: which parameters are estimated.
 
     Attributes:
-        radial: radial coefficients of the lens: 0 to 3, or 6 for the rational model; 0 to 4 of a fisheye.
-        tangential: whether coefficients of decentering are looked for.
-        fisheye: whether the lens is one.
-        square_pixels: one focal length for rows and columns.
-        principal_point: whether it is looked for; otherwise it is the center of the images.
-        robust: distance, in sigmas, from which a corner counts less; 0 for plain least squares.
+        radial: number of radial coefficients: 0 to 3, or 6 for the rational model; 0 to 4 of a fisheye lens.
+        tangential: whether tangential coefficients are estimated.
+        fisheye: whether the lens is a fisheye.
+        square_pixels: whether rows and columns share one focal length.
+        principal_point: whether it is estimated; otherwise it is the center of the images.
+        robust: threshold of Huber's loss, in standard deviations; 0 for plain least squares.
     """
 
     radial: int = 3
@@ -49,18 +49,18 @@ class Config(eqx.Module):
             raise ValueError(f"robust is {self.robust:g}, must not be negative")
 
     def intrinsics(self) -> Intrinsics:
-        """Which parameters move."""
+        """The parameters that are estimated."""
         lens = Fisheye(self.radial) if self.fisheye else Glass(self.radial, self.tangential)
         return Intrinsics(lens, self.square_pixels, self.principal_point)
 
 
 class Views(eqx.Module):
-    """Images of a board.
+    """Corners of a board in the images of one camera.
 
     Attributes:
         board: corners in the frame of the board, m.
-        corners: "boards corners 2", px; zero where the board was not found.
-        found: images in which it was.
+        corners: px; zero where the board was not found.
+        found: images in which it was found.
         shape: (rows, columns).
     """
 
@@ -71,11 +71,11 @@ class Views(eqx.Module):
 
 
 class Side(eqx.Module):
-    """What is known of one camera.
+    """Calibration of one camera.
 
     Attributes:
         camera: the camera.
-        parameters: its numbers, with covariance.
+        parameters: its parameters, with covariance.
         errors: predicted minus measured corners, px; zero where the board was not found.
         board_rms: of each image, px; zero where the board was not found.
         rms: of all, px.
@@ -95,7 +95,7 @@ class Result(eqx.Module):
         sides: the camera, or the left and the right one.
         estimate: of all unknowns.
         rectification: of a pair.
-        status: in words.
+        status: result of the solver, as text.
     """
 
     sides: tuple[Side, ...]
@@ -105,16 +105,16 @@ class Result(eqx.Module):
 
     @property
     def ok(self) -> bool:
-        """Whether it can be used."""
+        """Whether the solver converged to a usable estimate."""
         return bool(self.estimate.ok)
 
 
 def run(views: tuple[Views, ...], config: Config = Config()) -> Result:
-    """Calibrates one camera, or two that are fixed to each other, in float64 whatever JAX's default is.
+    """Calibrates one camera, or a stereo rig, in float64 whatever JAX's default is.
 
     Args:
         views: of the camera; or of the left and of the right camera, image by image at the same instants.
-        config: what is looked for.
+        config: options.
 
     Returns:
         The calibration.
@@ -161,11 +161,11 @@ def _stereo(left: Views, right: Views, config: Config) -> Result:
 
 
 def _corners(views: Views) -> Corners:
-    shown = np.broadcast_to(views.found[:, None], views.corners.shape[:2])
-    return Corners(jnp.asarray(views.corners), jnp.asarray(shown))
+    valid = np.broadcast_to(views.found[:, None], views.corners.shape[:2])
+    return Corners(jnp.asarray(views.corners), jnp.asarray(valid))
 
 
 def _side(camera: Pinhole, boards: Any, views: Views, parameters: Parameters) -> Side:
     corners = _corners(views)
-    left_over = board_errors(camera, boards, jnp.asarray(views.board), corners.pixels, valid=corners.valid)
-    return Side(camera, parameters, np.asarray(left_over.errors), np.asarray(left_over.board_rms), float(left_over.rms))
+    residuals = board_errors(camera, boards, jnp.asarray(views.board), corners.pixels, valid=corners.valid)
+    return Side(camera, parameters, np.asarray(residuals.errors), np.asarray(residuals.board_rms), float(residuals.rms))

@@ -1,33 +1,34 @@
-"""Localization of a laser log in an occupancy map: from anywhere or from a known start.
+"""Monte Carlo localization of a robot by laser scans in an occupancy map, from anywhere or from a known pose.
 
-Host code that drives `MonteCarloLocalization` in chunks of scans: many particles until the robot is found, few while
-its place is known, many again when scans stop fitting.
+Host code that drives `MonteCarloLocalization`, and adapts the number of particles: many until the robot is localized,
+few while it is, many again when scans stop fitting.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float64, Int, Key
+from jaxtyping import Array, Bool, Float, Float64, Key
 
 from jaxloc.beliefs import Gaussian
 from jaxloc.beliefs.particles import finite_log_weights
 from jaxloc.beliefs.resampling.indices import systematic
-from jaxloc.filters import MonteCarloLocalization, Recovery, run
+from jaxloc.filters import MonteCarloLocalization, Recovery
+from jaxloc.filters import run as run_filter
 from jaxloc.filters.localization import LocalizationState
 from jaxloc.poses import SE2
 from jaxloc.poses.planar import compose_poses, relative_poses
 from jaxloc.sensors import DistanceField, LaserScan, LikelihoodField, OccupancyMap, OdometryMotion
 
-_CLOUD = 600  # particles of a step that are kept for images
-_STREAK = 3  # scans in a row that must agree before the robot counts as found
+_CLOUD = 600  # particles in an output, for figures
+_STREAK = 3  # scans in a row that must agree before the robot counts as localized
 
 
 class Odometry(eqx.Module):
-    """How the odometry errs; see `OdometryMotion`.
+    """Noise of the odometry; see `OdometryMotion`.
 
     Attributes:
         turn_turn: rad for a rad of turn.
@@ -36,8 +37,8 @@ class Odometry(eqx.Module):
         drive_turn: m for a rad.
         turn_floor: rad a step.
         drive_floor: m a step.
-        slip: probability that a step's distance is not to be trusted.
-        slip_scale: how far it is off then, as a part of it.
+        slip: probability that the wheels slip in a step.
+        slip_scale: standard deviation of the distance in such a step, as a fraction of it.
     """
 
     turn_turn: float = 0.1
@@ -54,23 +55,23 @@ class Config(eqx.Module):
     """Options of localization.
 
     Attributes:
-        num_particles: while the place is known.
-        num_particles_global: while it is not.
-        num_beams: of a scan that are used.
-        sigma: of the end points of beams about the walls, m.
-        z_hit: part of the beams that end at walls of the map.
-        independent_beams: how many beams a scan is worth.
-        max_range: longer beams count nothing, m.
-        odometry: how it errs.
-        min_translation: a scan is used when the robot has moved so far since the last one, m,
+        num_particles: number of particles while the robot is localized.
+        num_particles_global: the same while it is not.
+        num_beams: number of beams of a scan that are used.
+        sigma: standard deviation of the end points of beams about the walls, m.
+        z_hit: probability that a beam ends at a wall of the map.
+        independent_beams: number of independent measurements that a scan is worth.
+        max_range: longer beams are ignored, m.
+        odometry: its noise.
+        min_translation: a scan is used when the robot has moved at least so far since the last one, m,
         min_rotation: or turned so far, rad.
-        least_ess: part of the particles that a scan leaves at least.
-        start_translation: standard deviation of a given start, m.
-        start_rotation: the same, rad.
-        found_mass: the place is known when one cluster holds so much of the weight,
-        found_spread: and its standard deviation is no greater, m.
-        lost_share: many particles again when so great a part is to be replaced by random ones.
-        chunk: scans between two looks at that.
+        least_ess: least effective sample size after a scan, as a fraction of the particles.
+        initial_translation: standard deviation of a given initial pose, m.
+        initial_rotation: the same, rad.
+        found_mass: the robot is localized when one cluster holds at least this fraction of the weight,
+        found_sigma: and its standard deviation is at most this, m.
+        lost_share: many particles again when a greater fraction is to be replaced by random ones.
+        chunk: number of used scans after which the number of particles is adapted.
         seed: of the random numbers.
     """
 
@@ -85,10 +86,10 @@ class Config(eqx.Module):
     min_translation: float = 0.1
     min_rotation: float = 0.1
     least_ess: float = 0.01
-    start_translation: float = 0.3
-    start_rotation: float = 0.2
+    initial_translation: float = 0.3
+    initial_rotation: float = 0.2
     found_mass: float = 0.95
-    found_spread: float = 0.3
+    found_sigma: float = 0.3
     lost_share: float = 0.15
     chunk: int = 10
     seed: int = 0
@@ -104,20 +105,34 @@ class Config(eqx.Module):
             raise ValueError(f"z_hit is {self.z_hit}, must lie between 0 and 1")
 
 
-class Step(eqx.Module):
-    """Where the robot was at one scan.
+class Scan(eqx.Module):
+    """One laser scan with the odometry at its time.
 
     Attributes:
-        index: number of the scan in the log.
+        time: stamp, s.
+        ranges: m; non-finite values are ignored.
+        odometry: pose (x, y, heading) by odometry, in a frame of its own, m and rad.
+    """
+
+    time: float
+    ranges: np.ndarray
+    odometry: Float64[np.ndarray, "3"]
+
+
+class Output(eqx.Module):
+    """Estimated pose at one scan.
+
+    Attributes:
+        index: number of the scan, from 0.
         time: stamp, s.
         pose: (x, y, heading) of the robot in the map, m and rad.
         covariance: of the pose, right tangent (x and y of the robot, heading); that of the last scan that was used.
-        mass: part of the weight in the cluster that the pose is the mean of.
-        updated: whether this scan was used; where not, odometry carried the pose on from the last one.
+        mass: fraction of the weight in the cluster that the pose is the mean of.
+        updated: whether this scan was used; otherwise odometry carried the pose on from the last one.
         ess: effective sample size.
-        inject: part of the cloud that scans asked to be replaced.
-        num_particles: of the cloud.
-        found: whether the place is known, and was at the scans used before.
+        inject: fraction of the particles that is to be replaced by random ones.
+        num_particles: number of particles.
+        found: whether the robot is localized: at this scan and at the used ones before.
         cloud: "m 3" some of the particles, drawn by weight; none where the scan was not used.
     """
 
@@ -134,53 +149,127 @@ class Step(eqx.Module):
     cloud: np.ndarray
 
 
-def steps(log: Any, grid: OccupancyMap, start: SE2 | None = None, config: Config | None = None) -> Iterator[Step]:
-    """Localizes a robot, a step a scan.
+class State(eqx.Module):
+    """State of the localization between two scans.
+
+    Attributes:
+        config: options.
+        filter: the particle filter, with the map.
+        belief: its state.
+        laser: (angle of the first beam, increment, greatest range), rad and m.
+        key: of the filter's steps.
+        last: output of the last scan that was used.
+        odometry: pose by odometry at that scan.
+        num_scans: number of scans so far.
+        num_used: number of used scans so far.
+        streak: number of used scans in a row with one small cluster.
+    """
+
+    config: Config
+    filter: MonteCarloLocalization
+    belief: LocalizationState
+    laser: tuple[float, float, float]
+    key: Key[Array, ""]
+    last: Output
+    odometry: Float64[np.ndarray, "3"]
+    num_scans: int
+    num_used: int
+    streak: int
+
+
+def init(config: Config, grid: OccupancyMap, laser: Any, *, initial: SE2 | None = None) -> State:
+    """The state before the first scan.
 
     Args:
-        log: a `LaserLog`, or any record with its fields.
-        grid: the map.
-        start: pose at the first scan; anywhere in the free space where not given.
         config: options.
-
-    Yields:
-        A step for each scan, the first included.
+        grid: the map.
+        laser: record with ``mount`` (x, y, heading of the laser on the robot), ``angle_min``, ``angle_increment`` and
+            ``max_range``, such as a `LaserLog`.
+        initial: pose at the first scan; anywhere in the free space where not given.
 
     Raises:
         ValueError: the map has no obstacle or no free cell.
+    """
+    filt = make_filter(laser, grid, config)
+    key_initial, key_run = jax.random.split(jax.random.key(config.seed))
+    if initial is None:
+        belief = filt.init_globally(config.num_particles_global, key=key_initial)
+    else:
+        sigmas = jnp.array([config.initial_translation, config.initial_translation, config.initial_rotation])
+        belief = filt.init_near(Gaussian(initial, jnp.diag(sigmas**2)), config.num_particles, key=key_initial)
+    zero = np.zeros(3)
+    nothing = np.zeros((0, 3), np.float32)
+    last = Output(-1, 0.0, zero, np.zeros((3, 3)), 0.0, False, 0.0, 0.0, belief.particles.size, False, nothing)
+    beams = (float(laser.angle_min), float(laser.angle_increment), float(laser.max_range))
+    return State(config, filt, belief, beams, key_run, last, zero, 0, 0, 0)
+
+
+def step(state: State, scan: Scan) -> tuple[State, Output]:
+    """Estimates the pose at the next scan.
+
+    A scan is used when the robot has moved enough since the last one that was; otherwise odometry carries the pose on.
+
+    Args:
+        state: from `init` or the last step.
+        scan: with its odometry.
+
+    Returns:
+        The next state, and the output of this scan.
+
+    Raises:
+        ValueError: the odometry has non-finite values, or the ranges are no vector.
 
     References:
         Thrun, Burgard, Fox, *Probabilistic Robotics*, 2005, chapter 8 [R-11].
     """
-    config = Config() if config is None else config
-    filt = make_filter(log, grid, config)
-    key_start, key_run = jax.random.split(jax.random.key(config.seed))
-    if start is None:
-        state = filt.init_globally(config.num_particles_global, key=key_start)
-    else:
-        sigmas = jnp.array([config.start_translation, config.start_translation, config.start_rotation])
-        state = filt.init_near(Gaussian(start, jnp.diag(sigmas**2)), config.num_particles, key=key_start)
-    used = select_scans(log.odometry, config.min_translation, config.min_rotation)
-    done, streak, last = 0, 0, None
-    for chunk in np.split(used, range(config.chunk, len(used), config.chunk)):
-        state, kept = _advance(filt, state, log, used, chunk, config, key_run)
-        for place in range(len(chunk)):
-            for index in range(done, chunk[place]):
-                yield _carried(last, log, index)
-            streak = streak + 1 if _is_sure(kept, place, config) else 0
-            last = _step(kept, place, int(chunk[place]), log, streak >= _STREAK, state.particles.size)
-            done = int(chunk[place]) + 1
-            yield last
-        state = _resize(filt, state, last, config)
-    for index in range(done, len(log.times)):
-        yield _carried(last, log, index)
+    _check(scan)
+    config, last = state.config, state.last
+    if state.num_used and not _has_moved(scan.odometry, state.odometry, config.min_translation, config.min_rotation):
+        output = _carried(last, state.odometry, scan, state.num_scans)
+        return eqx.tree_at(lambda s: s.num_scans, state, state.num_scans + 1), output
+    belief = state.belief
+    if state.num_used and state.num_used % config.chunk == 0:
+        belief = _resize(state.filter, belief, last, config)
+    before = state.odometry if state.num_used else scan.odometry
+    belief, history = _update(state, belief, before, scan)
+    streak = state.streak + 1 if _is_localized(history, config) else 0
+    output = _output(history, scan, state.num_scans, streak >= _STREAK, belief.particles.size)
+    counts = (state.num_scans + 1, state.num_used + 1, streak)
+    return State(config, state.filter, belief, state.laser, state.key, output, scan.odometry, *counts), output
 
 
-def make_filter(log: Any, grid: OccupancyMap, config: Config) -> MonteCarloLocalization:
-    """The filter for a log in a map.
+def run(log: Any, config: Config, grid: OccupancyMap, *, initial: SE2 | None = None) -> Iterator[Output]:
+    """Localizes a robot in a recording, see `step`.
 
     Args:
-        log: for the mount of its laser.
+        log: a `LaserLog`, or any record with its fields.
+        config: options.
+        grid: the map.
+        initial: pose at the first scan; anywhere in the free space where not given.
+
+    Yields:
+        An output for each scan, the first included.
+
+    Raises:
+        ValueError: the map has no obstacle or no free cell.
+    """
+    state = init(config, grid, log, initial=initial)
+    for scan in scans(log):
+        state, output = step(state, scan)
+        yield output
+
+
+def scans(log: Any) -> Iterable[Scan]:
+    """The scans of a `LaserLog`, one by one."""
+    for time, ranges, odometry in zip(log.times, log.ranges, log.odometry, strict=True):
+        yield Scan(float(time), ranges, odometry)
+
+
+def make_filter(laser: Any, grid: OccupancyMap, config: Config) -> MonteCarloLocalization:
+    """The particle filter for a laser in a map.
+
+    Args:
+        laser: for its mount on the robot.
         grid: the map.
         config: options.
 
@@ -191,14 +280,14 @@ def make_filter(log: Any, grid: OccupancyMap, config: Config) -> MonteCarloLocal
         ValueError: the map has no obstacle or no free cell.
     """
     if not bool(jnp.any(grid.occupied)):
-        raise ValueError("The map has no obstacle: nothing to localize by.")
+        raise ValueError("The map has no obstacle: there is nothing to localize by.")
     options = config.odometry
     names = [name for name in vars(Odometry()) if not name.startswith("_")]
     motion = OdometryMotion(**{name: getattr(options, name) for name in names})
     field = DistanceField.of(grid, ceiling=max(6.0 * config.sigma, 0.5), surfaces=True)
     sensor = LikelihoodField(
         field,
-        SE2(*log.mount),
+        SE2(*laser.mount),
         sigma=config.sigma,
         z_hit=config.z_hit,
         max_range=config.max_range,
@@ -208,66 +297,41 @@ def make_filter(log: Any, grid: OccupancyMap, config: Config) -> MonteCarloLocal
     return MonteCarloLocalization(motion, sensor, grid.free_space(), least_ess=config.least_ess, recovery=recovery)
 
 
-def select_scans(
-    odometry: Float64[np.ndarray, "n 3"], min_translation: float, min_rotation: float
-) -> Int[np.ndarray, " k"]:
-    """Scans that are worth using: the first, and each at which the robot has moved enough since the last.
-
-    Args:
-        odometry: poses (x, y, heading) at the scans, m and rad.
-        min_translation: m.
-        min_rotation: rad.
-
-    Returns:
-        Their indices.
-
-    Example:
-        >>> select_scans(np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.2, 0, 0.5]]), 0.15, 0.3).tolist()
-        [0, 2, 3]
-    """
-    chosen = [0]
-    for index in range(1, len(odometry)):
-        way = odometry[index] - odometry[chosen[-1]]
-        turn = abs((way[2] + np.pi) % (2.0 * np.pi) - np.pi)
-        if np.hypot(way[0], way[1]) >= min_translation or turn >= min_rotation:
-            chosen.append(index)
-    return np.array(chosen)
-
-
-class _Kept(eqx.Module):
-    """What an image and a table need of a state."""
+class _Cloud(eqx.Module):
+    """What the history of the filter holds of a state."""
 
     cloud: Float[Array, "m 3"]
 
 
-def _keep(state: LocalizationState) -> _Kept:
+def _draw_cloud(state: LocalizationState) -> _Cloud:
     particles = state.particles
     drawn = particles.take(systematic(jax.random.key(0), finite_log_weights(particles), _CLOUD))
     heading = jnp.arctan2(drawn.rotation.sin, drawn.rotation.cos)
-    return _Kept(jnp.concatenate([drawn.translation, heading[:, None]], axis=1))
+    return _Cloud(jnp.concatenate([drawn.translation, heading[:, None]], axis=1))
 
 
-def _advance(
-    filt: MonteCarloLocalization,
-    state: LocalizationState,
-    log: Any,
-    used: np.ndarray,
-    chunk: np.ndarray,
-    config: Config,
-    key: Key[Array, ""],
-) -> tuple[LocalizationState, Any]:
-    """The filter over one chunk, padded to a fixed number of scans so that one program serves all."""
-    size = config.chunk
-    padded = np.concatenate([chunk, np.full(size - len(chunk), chunk[-1])])
-    place = np.searchsorted(used, padded)
-    before = used[np.maximum(place - 1, 0)]
-    motions = relative_poses(log.odometry[before], log.odometry[padded]).astype(np.float32)
+def _check(scan: Scan) -> None:
+    if np.ndim(scan.ranges) != 1:
+        raise ValueError(f"The ranges of a scan have shape {np.shape(scan.ranges)}: give a vector.")
+    if not np.isfinite(scan.odometry).all():
+        raise ValueError(f"The odometry of a scan is {scan.odometry}: give finite numbers (x, y, heading).")
+
+
+def _has_moved(odometry: np.ndarray, before: np.ndarray, min_translation: float, min_rotation: float) -> bool:
+    motion = odometry - before
+    turn = abs((motion[2] + np.pi) % (2.0 * np.pi) - np.pi)
+    return bool(np.hypot(motion[0], motion[1]) >= min_translation or turn >= min_rotation)
+
+
+def _update(state: State, belief: LocalizationState, before: np.ndarray, scan: Scan) -> tuple[LocalizationState, Any]:
+    """The filter over one scan."""
+    first, increment, limit = state.laser
+    motions = relative_poses(before[None], scan.odometry[None]).astype(np.float32)
     controls = jax.vmap(SE2)(*jnp.asarray(motions).T)
-    scans = LaserScan(jnp.asarray(log.ranges[padded]), log.angle_min, log.angle_increment).thin(config.num_beams)
-    valid = _below_limit(scans.ranges, float(log.max_range))
-    active = jnp.asarray(np.arange(size) < len(chunk))
-    state, history = run(filt, state, controls, scans, valid, active=active, keep=_keep, key=key)
-    return state, jax.tree.map(np.asarray, history)
+    readings = LaserScan(jnp.asarray(scan.ranges)[None], first, increment).thin(state.config.num_beams)
+    valid = _below_limit(readings.ranges, limit)
+    belief, history = run_filter(state.filter, belief, controls, readings, valid, keep=_draw_cloud, key=state.key)
+    return belief, jax.tree.map(np.asarray, history)
 
 
 @eqx.filter_jit
@@ -275,16 +339,16 @@ def _below_limit(ranges: Float[Array, "t b"], limit: float) -> Bool[Array, "t b"
     return ranges < 0.999 * limit
 
 
-def _is_sure(history: Any, place: int, config: Config) -> bool:
+def _is_localized(history: Any, config: Config) -> bool:
     """Whether a scan leaves one small cluster."""
-    belief = history.infos.place
-    variance = belief.pose.covariance[place, 0, 0] + belief.pose.covariance[place, 1, 1]
-    good = belief.mass[place] >= config.found_mass and variance <= config.found_spread**2
-    return bool(good and history.infos.inject[place] <= config.lost_share)
+    place = history.infos.place
+    variance = place.pose.covariance[0, 0, 0] + place.pose.covariance[0, 1, 1]
+    good = place.mass[0] >= config.found_mass and variance <= config.found_sigma**2
+    return bool(good and history.infos.inject[0] <= config.lost_share)
 
 
-def _resize(filt: MonteCarloLocalization, state: LocalizationState, last: Step, config: Config) -> LocalizationState:
-    """Few particles where the robot is found, many where it is lost."""
+def _resize(filt: MonteCarloLocalization, state: LocalizationState, last: Output, config: Config) -> LocalizationState:
+    """Few particles where the robot is localized, many where it is lost."""
     wanted = state.particles.size
     if last.inject > config.lost_share:
         wanted = config.num_particles_global
@@ -295,40 +359,30 @@ def _resize(filt: MonteCarloLocalization, state: LocalizationState, last: Step, 
     return filt.resize(state, wanted, key=jax.random.fold_in(jax.random.key(config.seed + 1), last.index))
 
 
-def _step(history: Any, place: int, index: int, log: Any, found: bool, size: int) -> Step:
+def _output(history: Any, scan: Scan, index: int, found: bool, size: int) -> Output:
     infos = history.infos
     mean = infos.place.pose.mean
-    heading = np.arctan2(mean.rotation.sin[place], mean.rotation.cos[place])
-    return Step(
+    heading = np.arctan2(mean.rotation.sin[0], mean.rotation.cos[0])
+    return Output(
         index=index,
-        time=float(log.times[index]),
-        pose=np.array([*mean.translation[place], heading], dtype=np.float64),
-        covariance=infos.place.pose.covariance[place].astype(np.float64),
-        mass=float(infos.place.mass[place]),
+        time=scan.time,
+        pose=np.array([*mean.translation[0], heading], dtype=np.float64),
+        covariance=infos.place.pose.covariance[0].astype(np.float64),
+        mass=float(infos.place.mass[0]),
         updated=True,
-        ess=float(infos.ess[place]),
-        inject=float(infos.inject[place]),
+        ess=float(infos.ess[0]),
+        inject=float(infos.inject[0]),
         num_particles=size,
         found=found,
-        cloud=history.states.cloud[place],
+        cloud=history.states.cloud[0],
     )
 
 
-def _carried(last: Step, log: Any, index: int) -> Step:
-    """A scan that was not used: odometry carries the pose on."""
-    moved = relative_poses(log.odometry[last.index][None], log.odometry[index][None])[0]
+def _carried(last: Output, before: np.ndarray, scan: Scan, index: int) -> Output:
+    """The output of a scan that was not used: odometry carries the pose on."""
+    moved = relative_poses(before[None], scan.odometry[None])[0]
     pose = compose_poses(last.pose[None], moved[None])[0]
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
-    return Step(
-        index=index,
-        time=float(log.times[index]),
-        pose=pose,
-        covariance=last.covariance,
-        mass=last.mass,
-        updated=False,
-        ess=last.ess,
-        inject=last.inject,
-        num_particles=last.num_particles,
-        found=last.found,
-        cloud=np.zeros((0, 3), np.float32),
-    )
+    nothing = np.zeros((0, 3), np.float32)
+    counts = (last.mass, False, last.ess, last.inject, last.num_particles, last.found, nothing)
+    return Output(index, scan.time, pose, last.covariance, *counts)

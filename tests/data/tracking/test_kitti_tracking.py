@@ -104,9 +104,9 @@ def test_broken_detections_are_named(write, lines, error):
     [
         ([label(), label()[:-4]], "0000.txt: line 2 has 16 words, needs 17"),
         ([label(x="nan")], "line 1 holds a number that is not finite"),
-        ([label(type="Boat")], "line 1: Boat is no type of object"),
+        ([label(type="Boat")], "line 1: Boat is an unknown type of object"),
         ([label(id=-1)], "line 1: -1 is no identity"),
-        ([label(), label(1), label()], "line 3: identity 3 is there twice in frame 0"),
+        ([label(), label(1), label()], "line 3: identity 3 occurs twice in frame 0"),
     ],
 )
 def test_broken_labels_are_named(write, lines, error):

@@ -48,7 +48,7 @@ def test_tracks_written_are_read_again(write, tmp_path):
         ("1,nan,1,2,3,4,1\n", "line 1: nan is no identity"),
         ("1,1,1,2,0,4,1\n", "line 1 holds .* box without area"),
         ("\n1,1,inf,2,3,4,1\n", "line 2 holds a number that is not finite"),
-        ("1,1,1,2,3,4,1\n1,1,5,2,3,4,1\n", "line 2: identity 1 is there twice in frame 1"),
+        ("1,1,1,2,3,4,1\n1,1,5,2,3,4,1\n", "line 2: identity 1 occurs twice in frame 1"),
     ],
 )
 def test_broken_lines_are_named(write, text, error):

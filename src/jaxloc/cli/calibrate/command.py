@@ -1,4 +1,4 @@
-"""``jaxloc calibrate``: find the board in every image, calibrate, write cameras, corners and report."""
+"""``jaxloc calibrate``: intrinsics of a camera, or of a stereo rig, from images of a chessboard."""
 
 import re
 from pathlib import Path
@@ -9,8 +9,9 @@ import equinox as eqx
 import numpy as np
 import typer
 
-from jaxloc.cli import configuration, results, session
+from jaxloc.cli import lifecycle, session
 from jaxloc.cli.calibrate import report
+from jaxloc.cli.lifecycle import Arguments
 from jaxloc.data import DataError, camera_file
 from jaxloc.data.io.writing import RowWriter, write_file
 from jaxloc.features.opencv.chessboard import board_points, find_chessboard
@@ -20,7 +21,7 @@ _MOST_CORNERS = 10_000
 
 
 class Search(eqx.Module):
-    """What was found in the images of one camera.
+    """Corners found in the images of one camera.
 
     Attributes:
         paths: the images.
@@ -35,17 +36,21 @@ class Search(eqx.Module):
     shape: tuple[int, int]
 
 
-def run_images(
-    images: list[Path], right: list[Path] | None, board: tuple[str, float], out: Path, config_path: Path | None
-) -> int:
+def default_config() -> Any:
+    """The default options."""
+    from jaxloc.pipelines import calibration
+
+    return calibration.Config()
+
+
+def run_images(images: list[Path], right: list[Path] | None, board: tuple[str, float], arguments: Arguments) -> int:
     """Calibrates a camera, or two.
 
     Args:
         images: images, or folders of them, of the (left) camera.
         right: those of the right camera.
         board: inner corners as "9x6", and the edge of a square, m.
-        out: folder for the results.
-        config_path: YAML file with options.
+        arguments: output folder and options.
 
     Returns:
         The exit code.
@@ -53,36 +58,41 @@ def run_images(
     Raises:
         DataError: when any input is bad; nothing is written then.
     """
-    results.prepare(out)
+    lifecycle.prepare(arguments.out)
     grid, square = _grid(board[0]), board[1]
     if not (np.isfinite(square) and square > 0.0):
         raise DataError("--square", f"is {square:g}, must be positive: the edge of a square, m")
-    from jaxloc.pipelines import calibration as pipeline
-
-    default = pipeline.Config()
-    config = default if config_path is None else configuration.read_config(config_path, default)
+    config = arguments.read(default_config())
     lists = [list_images(paths) for paths in (images, right) if paths]
     if len({len(paths) for paths in lists}) > 1:
         raise DataError("--right", f"has {len(lists[1])} images, the left camera {len(lists[0])}: they must be pairs")
-    searches = [search(paths, grid, title) for paths, title in zip(lists, ("boards", "right boards"), strict=False)]
-    views = _views(searches, board_points(grid, square))
     inputs = {"command": "calibrate", "images": [str(path) for path in images], "grid": board[0], "square": square}
     inputs["right"] = None if right is None else [str(path) for path in right]
-    import jax
-
-    with jax.enable_x64(True):
-        result = pipeline.run(views, config)
-        if not result.ok:
-            raise DataError(images[0], f"no calibration: {result.status}; take more images, with the board tilted")
-        record = report.Record(searches, result)
-        with session.output_folder(out):
-            write_cameras(out, result, searches[0].shape)
-            _write_corners(out / "corners.csv", searches, result)
-            metrics = results.write(record, config, out, inputs)
+    searches = [search(paths, grid, title) for paths, title in zip(lists, ("boards", "right boards"), strict=False)]
+    with lifecycle.open_run(arguments.out) as run:
+        with session.show_progress("calibration", 1) as progress:
+            record = _calibrate(searches, board_points(grid, square), config)
+            progress(1)
+        write_cameras(arguments.out, record.result, searches[0].shape)
+        _write_corners(arguments.out / "corners.csv", searches, record.result)
+        code = run.finish(record, config, inputs, _summary)
     for line in record.skipped():
         typer.echo(f"skipped {line}", err=True)
-    typer.echo(f"{metrics['boards_used']} boards, rms {metrics['rms_px']:.3f} px: {out / 'report.html'}")
-    return 0
+    return code
+
+
+def _calibrate(searches: list[Search], board: np.ndarray, config: Any) -> report.Record:
+    from jaxloc.pipelines import calibration
+
+    result = calibration.run(_views(searches, board), config)
+    if not result.ok:
+        path = searches[0].paths[0]
+        raise DataError(path, f"no calibration: {result.status}; take more images, with the board tilted")
+    return report.Record(searches, result)
+
+
+def _summary(metrics: dict[str, Any]) -> str:
+    return f"{metrics['boards_used']} boards, rms {metrics['rms_px']:.3f} px"
 
 
 def list_images(paths: list[Path]) -> list[Path]:
@@ -106,12 +116,12 @@ def list_images(paths: list[Path]) -> list[Path]:
 
 
 def search(paths: list[Path], grid: tuple[int, int], title: str) -> Search:
-    """Looks for the board in every image; one that cannot be used is skipped, with the reason.
+    """Searches the board in every image; one that cannot be used is skipped, with the reason.
 
     Raises:
         DataError: when no image can be read.
     """
-    pictures_shape = _common_shape(paths)
+    common_shape = _common_shape(paths)
     corners: list[np.ndarray | None] = []
     reasons: list[str] = []
     with session.show_progress(title, len(paths)) as progress:
@@ -120,15 +130,15 @@ def search(paths: list[Path], grid: tuple[int, int], title: str) -> Search:
             found, reason = None, ""
             if image is None:
                 reason = "cannot be read as an image"
-            elif image.shape != pictures_shape:
-                reason = f"is {_size(image.shape)}, the others are {_size(pictures_shape)}"
+            elif image.shape != common_shape:
+                reason = f"is {_size(image.shape)}, the others are {_size(common_shape)}"
             else:
                 found = find_chessboard(image, grid)
                 reason = "" if found is not None else f"shows no whole board of {grid[0]}x{grid[1]} inner corners"
             corners.append(found)
             reasons.append(reason)
             progress(number + 1)
-    return Search(paths, corners, reasons, pictures_shape)
+    return Search(paths, corners, reasons, common_shape)
 
 
 def write_cameras(out: Path, result: Any, shape: tuple[int, int]) -> None:
@@ -148,7 +158,7 @@ def write_cameras(out: Path, result: Any, shape: tuple[int, int]) -> None:
 
 
 def _stereo_entries(result: Any, shape: tuple[int, int]) -> dict[str, Any]:
-    """The layout of OpenCV's stereo samples; R and T take points of the left camera to the right one."""
+    """Entries as of OpenCV's stereo samples; R and T map points of the left camera to the right one."""
     value, rectified = result.estimate.value, result.rectification
     entries: dict[str, Any] = {"image_width": shape[1], "image_height": shape[0]}
     entries |= camera_file.lens_entries(value.left, "M1", "D1") | camera_file.lens_entries(value.right, "M2", "D2")
@@ -166,7 +176,7 @@ def _stereo_entries(result: Any, shape: tuple[int, int]) -> dict[str, Any]:
 
 
 def _stereo_covariance(result: Any) -> dict[str, Any]:
-    """Of both cameras and the pose of the right one in the left one's frame, in the tangent of that pose."""
+    """Joint covariance of both cameras' parameters and of ``T_left_right``, in the tangent of that pose."""
     names = [f"{name}_{number}" for number, side in enumerate(result.sides, 1) for name in side.parameters.names]
     names += [f"T_left_right_{name}" for name in result.estimate.value.T_left_right.labels]
     size = len(names)
@@ -207,7 +217,7 @@ def _views(searches: list[Search], board: np.ndarray) -> tuple[Any, ...]:
     for found in searches:
         used = np.array([corners is not None for corners in found.corners])
         if not used.any():
-            raise DataError(found.paths[0], f"{found.reasons[0]}; nor does any other of {len(used)} images help")
+            raise DataError(found.paths[0], f"{found.reasons[0]}; none of {len(used)} images can be used")
         empty = np.zeros((len(board), 2))
         stacked = np.stack([empty if corners is None else corners for corners in found.corners])
         views.append(pipeline.Views(board, stacked, used, found.shape))

@@ -1,4 +1,4 @@
-"""What a calibration says of itself: numbers for metrics.json and the page of the report."""
+"""Metrics and report of a camera calibration."""
 
 from typing import Any
 
@@ -14,13 +14,14 @@ class Record:
     """A finished calibration.
 
     Args:
-        searches: what was found in the images, a camera each.
+        searches: corners found in the images, one for each camera.
         result: of the pipeline.
     """
 
     def __init__(self, searches: list[Any], result: Any):
         self.searches = searches
         self.result = result
+        self.interrupted = False
 
     def skipped(self) -> list[str]:
         """A line for each image that was not used."""
@@ -50,18 +51,18 @@ class Record:
         return results.finite(numbers)
 
     def page(self, metrics: dict[str, Any]) -> str:
-        """The page."""
+        """The report as HTML."""
         sections = []
         for side, found, name in zip(self.result.sides, self.searches, self._names(), strict=True):
             title = name.replace("_", " ").capitalize()
-            text = "Values with one standard deviation; what was held has none."
+            text = "Values with one standard deviation; fixed parameters have none."
             sections.append(report.Section(f"{title}Parameters".strip(), text, table=_parameters(side)))
-            text = "Where corners are predicted, less where they were found. Evenly spread errors are noise."
+            text = "Predicted minus measured corners. Errors without a pattern are noise."
             sections.append(report.Section(f"{title}Residuals".strip(), text, _scatter(side, found)))
             text = "Root mean square of the distance between predicted and found corners."
             sections.append(report.Section(f"{title}Boards".strip(), text, table=_boards(side, found)))
         numbers = {key: value for key, value in metrics.items() if not isinstance(value, dict | list)}
-        sections.append(report.Section("Numbers", "SI units, or the unit in the name.", table=results.table(numbers)))
+        sections.append(results.numbers_section(numbers))
         first = self.result.sides[0].parameters
         focal, sigma = float(first.values[0]), float(first.sigmas()[0])
         highlights = (
@@ -84,7 +85,7 @@ def _parameters(side: Any) -> report.Table:
     numbers = side.parameters
     rows = []
     for name, value, sigma in zip(numbers.names, np.asarray(numbers.values), np.asarray(numbers.sigmas()), strict=True):
-        rows.append((name, f"{value:.6g}", f"{sigma:.2g}" if sigma > 0 else "held"))
+        rows.append((name, f"{value:.6g}", f"{sigma:.2g}" if sigma > 0 else "fixed"))
     return report.Table(("parameter", "value", "standard deviation"), tuple(rows))
 
 
@@ -99,16 +100,16 @@ def _scatter(side: Any, found: Any) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 4.0), layout="constrained", facecolor="white")
-    scatter, spread = figure.subplots(1, 2)
+    scatter, field = figure.subplots(1, 2)
     for corners, errors in zip(found.corners, side.errors, strict=True):
         if corners is not None:
             scatter.plot(errors[:, 0], errors[:, 1], ".", markersize=3, alpha=0.7)
-            spread.quiver(corners[:, 0], corners[:, 1], errors[:, 0], errors[:, 1], angles="xy", width=0.002)
-    for axis, words in ((scatter, ("error right (px)", "error down (px)")), (spread, ("column (px)", "row (px)"))):
+            field.quiver(corners[:, 0], corners[:, 1], errors[:, 0], errors[:, 1], angles="xy", width=0.002)
+    for axis, words in ((scatter, ("error right (px)", "error down (px)")), (field, ("column (px)", "row (px)"))):
         axis.set_xlabel(words[0])
         axis.set_ylabel(words[1])
         axis.set_aspect("equal", adjustable="box")
         axis.grid(True, color="#e6e8eb", linewidth=0.8)
-    spread.set_xlim(0, found.shape[1])
-    spread.set_ylim(found.shape[0], 0)
+    field.set_xlim(0, found.shape[1])
+    field.set_ylim(found.shape[0], 0)
     return figure

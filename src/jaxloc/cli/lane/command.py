@@ -1,31 +1,38 @@
-"""``jaxloc lane``: follow the lane, write a row an image as they come, then metrics and report."""
+"""``jaxloc lane``: lane following in images or a video."""
 
 import dataclasses
 import itertools
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import typer
-
-from jaxloc.cli import configuration, results, session
+from jaxloc.cli import lifecycle
 from jaxloc.cli.lane import drawing, report
+from jaxloc.cli.lifecycle import Arguments
 from jaxloc.data import DataError
 from jaxloc.data.camera_file import CameraFile, read_camera
 from jaxloc.data.io.writing import RowWriter
 from jaxloc.data.road_images import LaneFrame, LaneRecording, open_recording
 from jaxloc.sensors.ground_camera import GroundCamera
 
+_FILES = {"lane.csv": "frame,offset,heading,curvature,confidence,ok", "borders.csv": "frame,row,left,right"}
 
-def run_recording(path: Path, camera_path: Path, speed: float, out: Path, config_path: Path | None) -> int:
+
+def default_config() -> Any:
+    """The default options."""
+    from jaxloc.pipelines import lane_following
+
+    return lane_following.Config()
+
+
+def run_recording(path: Path, camera_path: Path, speed: float, arguments: Arguments) -> int:
     """Follows the lane in a recording.
 
     Args:
         path: image, folder of images, or video.
         camera_path: YAML file of the camera.
         speed: of the vehicle, m/s.
-        out: folder for the results.
-        config_path: YAML file with options.
+        arguments: output folder and options.
 
     Returns:
         The exit code.
@@ -33,36 +40,54 @@ def run_recording(path: Path, camera_path: Path, speed: float, out: Path, config
     Raises:
         DataError: when any input is bad; nothing is written then.
     """
-    results.prepare(out)
+    lifecycle.prepare(arguments.out)
     file = read_camera(camera_path)
-    height = file.require_height()
+    ground = GroundCamera(file.camera, file.require_height(), file.pitch or 0.0, file.roll or 0.0)
     recording = open_recording(path)
     _check_shape(file, recording)
-    from jaxloc.pipelines import lane_following as pipeline
-
-    default = pipeline.Config()
-    config = default if config_path is None else configuration.read_config(config_path, default)
     try:
-        config = dataclasses.replace(config, speed=speed)
+        config = dataclasses.replace(arguments.read(default_config()), speed=speed)
+    except DataError:
+        raise
     except ValueError as error:
         raise DataError("--speed", str(error)) from None
-    ground = GroundCamera(file.camera, height, file.pitch or 0.0, file.roll or 0.0)
+    state, pitch = _begin(recording, ground, config, file)
+    record = report.Record(recording, pitch, float(state.tracker.ground.pitch))
+    inputs = {"command": "lane", "path": str(path), "camera": str(camera_path), "speed": speed}
+    with lifecycle.open_run(arguments.out) as run, drawing.open_gallery(recording, arguments.out) as gallery:
+
+        def write(pair: tuple[LaneFrame, Any], rows: Mapping[str, RowWriter]) -> None:
+            frame, output = pair
+            _append(rows["lane.csv"], rows["borders.csv"], frame, output)
+            image = drawing.annotate(frame.color, output)
+            gallery(frame, image)
+            record.add(frame.name, frame.time, output, image)
+
+        run.stream(_outputs(recording, state), write, title="lane", total=len(recording), files=_FILES)
+        return run.finish(record, config, inputs, _summary)
+
+
+def _begin(recording: LaneRecording, ground: GroundCamera, config: Any, file: CameraFile) -> tuple[Any, Any]:
+    """The state of the pipeline before the first image, and the pitch where it was estimated."""
+    from jaxloc.pipelines import lane_following
+
     pitch = None
     if file.pitch is None:
-        pitch, ground = pipeline.level(itertools.islice(recording, config.pitch_frames), ground)
+        pitch, ground = lane_following.correct_pitch(itertools.islice(recording, config.pitch_frames), ground)
     try:
         sigma = None if pitch is None else pitch.sigma
-        follower = pipeline.LaneFollower(ground, recording.shape, config, pitch_sigma=sigma)
+        return lane_following.init(config, ground, recording.shape, pitch_sigma=sigma), pitch
     except ValueError as error:
-        raise DataError(camera_path, str(error)) from None
-    record = report.Record(recording, pitch, float(ground.pitch))
-    inputs = {"command": "lane", "path": str(path), "camera": str(camera_path), "speed": speed}
-    with session.Interruption() as interruption, session.output_folder(out):
-        _stream(recording, follower, out, record, interruption)
-        record.interrupted = interruption.requested
-        metrics = results.write(record, config, out, inputs)
-    _announce(metrics, out)
-    return 130 if record.interrupted else 0
+        raise DataError(file.path, str(error)) from None
+
+
+def _outputs(recording: LaneRecording, state: Any) -> Iterator[tuple[LaneFrame, Any]]:
+    """Each image with the pipeline's output."""
+    from jaxloc.pipelines import lane_following
+
+    for frame in recording:
+        state, output = lane_following.step(state, frame)
+        yield frame, output
 
 
 def _check_shape(file: CameraFile, recording: LaneRecording) -> None:
@@ -71,45 +96,15 @@ def _check_shape(file: CameraFile, recording: LaneRecording) -> None:
         raise DataError(file.path, f"is of images of {sizes[0]}, but those of {recording.path} are {sizes[1]}")
 
 
-def _stream(
-    recording: LaneRecording,
-    follower: Any,
-    out: Path,
-    record: report.Record,
-    interruption: session.Interruption,
-) -> None:
-    """Writes the rows and the annotated image of each image, until the end or an interrupt."""
-    with ExitStack() as stack:
-        lanes = stack.enter_context(RowWriter(out / "lane.csv", "frame,offset,heading,curvature,confidence,ok"))
-        borders = stack.enter_context(RowWriter(out / "borders.csv", "frame,row,left,right"))
-        gallery = stack.enter_context(drawing.open_gallery(recording, out))
-        progress = stack.enter_context(session.show_progress("lane", len(recording)))
-        for frame in recording:
-            step = follower.follow(frame)
-            _append(lanes, borders, frame, step)
-            picture = drawing.annotate(frame.color, step)
-            gallery(frame, picture)
-            record.add(frame.name, frame.time, step, picture)
-            progress(frame.index + 1)
-            if interruption.requested:
-                break
-        if not record.steps:
-            raise typer.Abort
-
-
-def _append(lanes: RowWriter, borders: RowWriter, frame: LaneFrame, step: Any) -> None:
-    offset, heading, curvature, _ = step.lane
-    lanes.append(f"{frame.index},{offset:.4f},{heading:.6f},{curvature:.7f},{step.confidence:.3f},{step.ok:d}")
-    for row, left, right in zip(step.rows, step.left, step.right, strict=True):
+def _append(lanes: RowWriter, borders: RowWriter, frame: LaneFrame, output: Any) -> None:
+    offset, heading, curvature, _ = output.lane
+    lanes.append(f"{frame.index},{offset:.4f},{heading:.6f},{curvature:.7f},{output.confidence:.3f},{output.ok:d}")
+    for row, left, right in zip(output.rows, output.left, output.right, strict=True):
         borders.append(f"{frame.index},{row:.0f},{left:.2f},{right:.2f}")
 
 
-def _announce(metrics: dict[str, Any], out: Path) -> None:
-    words = [f"{metrics['frames']} images", f"lane seen in {metrics['frames_ok']}"]
+def _summary(metrics: dict[str, Any]) -> str:
+    text = f"{metrics['frames']} images, lane measured in {metrics['frames_ok']}"
     if metrics["pitch_estimated"]:
-        words.append(f"pitch estimated: {metrics['pitch_rad']:.4f} rad")
-    elif metrics["pitch_assumed"]:
-        words.append("pitch not known, taken as zero: no vanishing point found")
-    if metrics["interrupted"]:
-        words.append("interrupted")
-    typer.echo(f"{', '.join(words)}: {out / 'report.html'}")
+        return f"{text}, pitch estimated: {metrics['pitch_rad']:.4f} rad"
+    return f"{text}, pitch not known, taken as zero: no vanishing point found" if metrics["pitch_assumed"] else text

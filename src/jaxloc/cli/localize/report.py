@@ -1,4 +1,4 @@
-"""What a run of the localization says of itself: numbers for metrics.json and the page of the report."""
+"""Metrics and report of localization in a map."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ class Reference(eqx.Module):
     poses: Float64[np.ndarray, "n 3"]
 
     def match(self, times: Float64[np.ndarray, " m"]) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-        """Which of some times have a pose here, and which pose that is."""
+        """Indices of times with a reference pose at the same time, and of these poses."""
         after = np.clip(np.searchsorted(self.times, times), 1, max(len(self.times) - 1, 1))
         before = after - 1
         after = np.minimum(after, len(self.times) - 1)
@@ -38,7 +38,7 @@ class Reference(eqx.Module):
 
 
 class Record:
-    """What a run has given so far.
+    """Outputs of a run so far.
 
     Args:
         log: the recording.
@@ -51,30 +51,30 @@ class Record:
         self.grid = grid
         self.reference = reference
         self.interrupted = False
-        self.steps: list[Any] = []
+        self.outputs: list[Any] = []
 
-    def add(self, step: Any) -> None:
+    def add(self, output: Any) -> None:
         """Adds a scan."""
-        self.steps.append(step)
+        self.outputs.append(output)
 
     def poses(self) -> np.ndarray:
         """Estimated poses (x, y, heading)."""
-        return np.stack([step.pose for step in self.steps])
+        return np.stack([output.pose for output in self.outputs])
 
     def times(self) -> np.ndarray:
         """Stamps, s."""
-        return np.array([step.time for step in self.steps])
+        return np.array([output.time for output in self.outputs])
 
     def found(self) -> np.ndarray:
-        """Scans at which the place was known."""
-        return np.array([step.found for step in self.steps])
+        """Scans at which the robot was localized."""
+        return np.array([output.found for output in self.outputs])
 
     def metrics(self) -> dict[str, Any]:
         """The numbers of metrics.json: SI units, or the unit in the name."""
         found, times, poses = self.found(), self.times(), self.poses()
-        used = [step for step in self.steps if step.updated]
+        used = [output for output in self.outputs if output.updated]
         numbers: dict[str, Any] = {
-            "scans": len(self.steps),
+            "scans": len(self.outputs),
             "scans_of_log": len(self.log),
             "scans_dropped": self.log.dropped,
             "scans_used": len(used),
@@ -83,17 +83,17 @@ class Record:
             "found_fraction": float(found.mean()),
             "found_at_end": bool(found[-1]),
             "distance_m": float(np.linalg.norm(np.diff(poses[found, :2], axis=0), axis=1).sum()),
-            "median_ess": float(np.median([step.ess for step in used])),
-            "median_sigma_m": float(np.median([_sigma(step) for step in used])),
-            "most_particles": max(step.num_particles for step in used),
-            "least_particles": min(step.num_particles for step in used),
+            "median_ess": float(np.median([output.ess for output in used])),
+            "median_sigma_m": float(np.median([_sigma(output) for output in used])),
+            "most_particles": max(output.num_particles for output in used),
+            "least_particles": min(output.num_particles for output in used),
         }
         if self.reference is not None:
             numbers |= self._accuracy(found)
         return results.finite(numbers)
 
     def errors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which scans can be compared, and (x, y, heading) of the reference from the estimate there."""
+        """Indices of scans with a reference, and the error (x, y, heading): the reference relative to the estimate."""
         if self.reference is None:
             raise ValueError("There is no reference to compare with.")
         indices, partners = self.reference.match(self.times())
@@ -117,11 +117,11 @@ class Record:
         return numbers
 
     def page(self, metrics: dict[str, Any]) -> str:
-        """The page."""
+        """The report as HTML."""
         image, poses, found = self._image(), self.poses(), self.found()
         reference = None if self.reference is None else self.reference.poses
         path = plots.draw_map_path(image, poses, reference, found)
-        text = "Estimated path over the map; poses from before the robot was found are dots."
+        text = "Estimated path over the map; poses before the robot was localized are dots."
         sections = [report.Section("Path", text, path, raster=True)]
         clouds = plots.draw_clouds(image, self._snapshots())
         text = "The particles at several times; the arrow is the estimate" + (
@@ -129,7 +129,7 @@ class Record:
         )
         sections.append(report.Section("Particles", text, clouds, raster=True))
         sections += self._error_section() + self._confidence_sections()
-        sections.append(report.Section("Numbers", "SI units, or the unit in the name.", table=results.table(metrics)))
+        sections.append(results.numbers_section(metrics))
         summary = f"{metrics['scans']} scans, {metrics['scans_used']} used."
         if self.interrupted:
             summary += " Interrupted: the report ends with the last scan that was processed."
@@ -142,15 +142,15 @@ class Record:
         return plots.MapImage.of(np.asarray(grid.occupied), np.asarray(grid.free), origin, float(grid.resolution))
 
     def _snapshots(self) -> list[plots.Snapshot]:
-        """The first scans, where most happens, and some along the way."""
-        used = [step for step in self.steps if step.updated]
+        """Particles at the first scans, where they change most, and at some later ones."""
+        used = [output for output in self.outputs if output.updated]
         late = np.linspace(0, len(used) - 1, _NUM_CLOUDS - 2).round().astype(int)[1:]
         chosen = sorted({0, min(1, len(used) - 1), min(3, len(used) - 1), *late.tolist()})
         truths: dict[int, np.ndarray] = {}
         if self.reference is not None:
             pairs = self.reference.match(np.array([used[number].time for number in chosen]))
             truths = {chosen[i]: self.reference.poses[j] for i, j in zip(*pairs, strict=True)}
-        begin = self.steps[0].time
+        begin = self.outputs[0].time
         return [
             plots.Snapshot(
                 f"after {used[number].time - begin:.1f} s, {used[number].num_particles} particles",
@@ -167,40 +167,40 @@ class Record:
         indices, errors = self.errors()
         if not len(indices):
             return []
-        sigmas = np.array([_sigma(self.steps[index]) for index in indices])
+        sigmas = np.array([_sigma(self.outputs[index]) for index in indices])
         curves = {"error": np.hypot(errors[:, 0], errors[:, 1]), "one standard deviation": sigmas}
-        times = self.times()[indices] - self.steps[0].time
+        times = self.times()[indices] - self.outputs[0].time
         figure = plots.draw_curves(times, curves, "position (m)", logarithmic=True)
-        return [report.Section("Error", "Distance to the reference, and what the filter believes it to be.", figure)]
+        return [report.Section("Error", "Distance to the reference, and its estimated standard deviation.", figure)]
 
     def _confidence_sections(self) -> list[report.Section]:
-        used = [step for step in self.steps if step.updated]
-        times = np.array([step.time for step in used]) - self.steps[0].time
+        used = [output for output in self.outputs if output.updated]
+        times = np.array([output.time for output in used]) - self.outputs[0].time
         sizes = {
-            "effective": np.array([step.ess for step in used]),
-            "particles": np.array([float(step.num_particles) for step in used]),
+            "effective": np.array([output.ess for output in used]),
+            "particles": np.array([float(output.num_particles) for output in used]),
         }
         shares = {
-            "weight of the place": np.array([step.mass for step in used]),
-            "replaced by random poses": np.array([step.inject for step in used]),
+            "weight of the main cluster": np.array([output.mass for output in used]),
+            "replaced by random poses": np.array([output.inject for output in used]),
         }
         return [
             report.Section(
                 "Effective sample size",
-                "How many particles carry the weight, and how many there are.",
+                "Effective sample size, and number of particles.",
                 plots.draw_curves(times, sizes, "particles", logarithmic=True),
             ),
             report.Section(
                 "Confidence",
-                "Part of the weight in the most likely place, and part of the cloud that bad fits ask to replace.",
-                plots.draw_curves(times, shares, "part"),
+                "Fraction of the weight in the main cluster, and of the particles to be replaced by random ones.",
+                plots.draw_curves(times, shares, "fraction"),
             ),
         ]
 
 
-def _sigma(step: Any) -> float:
+def _sigma(output: Any) -> float:
     """Standard deviation of the position, m."""
-    return float(np.sqrt(max(step.covariance[0, 0] + step.covariance[1, 1], 1e-12)))
+    return float(np.sqrt(max(output.covariance[0, 0] + output.covariance[1, 1], 1e-12)))
 
 
 def _highlights(metrics: dict[str, Any]) -> tuple[report.Highlight, ...]:
@@ -211,5 +211,4 @@ def _highlights(metrics: dict[str, Any]) -> tuple[report.Highlight, ...]:
         ("found_after_s", "found after", "{:.1f} s"),
         ("distance_m", "distance", "{:.0f} m"),
     )
-    shown = [(label, form.format(metrics[name])) for name, label, form in wanted if metrics.get(name) is not None]
-    return tuple(report.Highlight(label, value) for label, value in shown)
+    return results.highlights(metrics, wanted)

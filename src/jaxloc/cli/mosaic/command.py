@@ -1,14 +1,16 @@
-"""``jaxloc mosaic``: join images of a floor to a map, then metrics and report."""
+"""``jaxloc mosaic``: a mosaic of a floor from images and odometry."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import typer
 
-from jaxloc.cli import configuration, results, session
+from jaxloc.cli import lifecycle
+from jaxloc.cli.lifecycle import Arguments
 from jaxloc.cli.mosaic import report
+from jaxloc.cli.planar import planar_matrix, planar_poses
 from jaxloc.data import DataError, tum
 from jaxloc.data.camera_file import read_camera
 from jaxloc.data.io.writing import write_file
@@ -19,7 +21,14 @@ _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 _LIGHTEST = 255.0
 
 
-def run_frames(frames: Path, odometry: Path, camera: Path, out: Path, config_path: Path | None) -> int:
+def default_config() -> Any:
+    """The default options."""
+    from jaxloc.pipelines import floor_mosaic
+
+    return floor_mosaic.Config()
+
+
+def run_frames(frames: Path, odometry: Path, camera: Path, arguments: Arguments) -> int:
     """Makes a mosaic of a folder of images.
 
     Args:
@@ -27,8 +36,7 @@ def run_frames(frames: Path, odometry: Path, camera: Path, out: Path, config_pat
         odometry: TUM file with a pose of the camera over the floor for each image: x to the top of the image, y to
             its left; only the motions between rows count, and only in the plane.
         camera: file of the camera, with its height over the floor.
-        out: folder for the results.
-        config_path: YAML file with options.
+        arguments: output folder and options.
 
     Returns:
         The exit code.
@@ -36,36 +44,49 @@ def run_frames(frames: Path, odometry: Path, camera: Path, out: Path, config_pat
     Raises:
         DataError: when any input is bad; nothing is written then.
     """
-    results.prepare(out)
-    paths = find_pictures(frames)
-    stamped = _read_odometry(odometry, len(paths))
-    poses = planar_rows(stamped)
+    lifecycle.prepare(arguments.out)
+    paths = find_images(frames)
+    times, poses = planar_poses(_read_odometry(odometry, len(paths)))
     ground, shape = _read_ground(camera)
-    images = _read_pictures(paths, shape)
-    from jaxloc.pipelines import floor_mosaic as pipeline
-
-    default = pipeline.Config()
-    config = default if config_path is None else configuration.read_config(config_path, default)
+    images = _read_images(paths, shape)
+    config = arguments.read(default_config())
     inputs = {"command": "mosaic", "frames": str(frames), "odometry": str(odometry), "camera": str(camera)}
-    with session.output_folder(out):
-        motions = relative_poses(poses[:-1], poses[1:])
+    with lifecycle.open_run(arguments.out) as run:
+        last: dict[str, Any] = {}
         try:
-            built = pipeline.make_mosaic(images, motions, ground, start=poses[0], config=config)
+            outputs = _register(images, poses, ground, config)
+            run.stream(outputs, lambda state, _: last.update(state=state), title="registration", total=len(paths))
+            built = _finish(last["state"])
         except ValueError as error:
             raise DataError(odometry, " ".join(str(error).split())) from None
         if not built.used.any():
             raise DataError(frames, "no image overlaps another: there is nothing to join")
-        _write_map(built, out)
-        times = np.asarray(stamped.trajectory.times, np.float64) + stamped.start
-        _write_path(times, built.poses, out)
-        names = tuple(path.name for path in paths)
-        metrics = results.write(report.Record(names, times, poses, built), config, out, inputs)
-    _announce(metrics, out)
-    return 0
+        count = len(built.poses)
+        _write_map(built, arguments.out)
+        _write_path(times[:count], built.poses, arguments.out)
+        record = report.Record(tuple(path.name for path in paths[:count]), times[:count], poses[:count], built)
+        return run.finish(record, config, inputs, _summary)
 
 
-def find_pictures(folder: Path) -> list[Path]:
-    """Images of a folder, by name.
+def _register(images: np.ndarray, poses: np.ndarray, ground: Any, config: Any) -> Iterator[Any]:
+    """The state of the pipeline after each image."""
+    from jaxloc.pipelines import floor_mosaic
+
+    view = floor_mosaic.make_view(images, ground, config)
+    state = floor_mosaic.init(config, view, initial=poses[0])
+    for frame in floor_mosaic.split_frames(images, relative_poses(poses[:-1], poses[1:]), config=config):
+        state, _ = floor_mosaic.step(state, frame)
+        yield state
+
+
+def _finish(state: Any) -> Any:
+    from jaxloc.pipelines import floor_mosaic
+
+    return floor_mosaic.finish(state)
+
+
+def find_images(folder: Path) -> list[Path]:
+    """Images of a folder, in the order of their names.
 
     Raises:
         DataError: when there is no such folder, or less than two images in it.
@@ -76,12 +97,6 @@ def find_pictures(folder: Path) -> list[Path]:
     if len(paths) < 2:
         raise DataError(folder, f"holds {len(paths)} images ({', '.join(_ENDINGS)}); a mosaic needs two or more")
     return paths
-
-
-def planar_rows(stamped: StampedTrajectory) -> np.ndarray:
-    """Poses (x, y, heading) of a trajectory: what it says of the plane."""
-    matrices = np.asarray(stamped.trajectory.matrices(), dtype=np.float64)
-    return np.column_stack([matrices[:, :2, 3], np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])])
 
 
 def _read_odometry(path: Path, count: int) -> StampedTrajectory:
@@ -97,13 +112,13 @@ def _read_ground(path: Path) -> tuple[Any, tuple[int, int] | None]:
 
     record = read_camera(path)
     height = record.require_height()
-    # Files of cameras that look straight down need not say so.
+    # By default a camera looks straight down.
     pitch = 0.5 * np.pi if record.pitch is None else record.pitch
     ground = GroundCamera(record.camera, height, pitch=pitch, roll=0.0 if record.roll is None else record.roll)
     return ground, record.shape
 
 
-def _read_pictures(paths: list[Path], shape: tuple[int, int] | None) -> np.ndarray:
+def _read_images(paths: list[Path], shape: tuple[int, int] | None) -> np.ndarray:
     images = []
     for path in paths:
         data = np.fromfile(path, np.uint8)
@@ -123,8 +138,8 @@ def _write_map(built: Any, out: Path) -> None:
     """The image (its first row is the top: the largest y), gaps black, and its place on the floor."""
     mosaic = built.mosaic
     values = np.clip(np.rint(np.asarray(mosaic.values)), 1.0, _LIGHTEST)
-    picture = np.where(np.asarray(mosaic.known), values, 0.0).astype(np.uint8)[::-1]
-    write_file(out / "mosaic.png", cv2.imencode(".png", picture)[1].tobytes())
+    image = np.where(np.asarray(mosaic.known), values, 0.0).astype(np.uint8)[::-1]
+    write_file(out / "mosaic.png", cv2.imencode(".png", image)[1].tobytes())
     resolution = float(mosaic.raster.resolution)
     # As in maps of the ROS map server: the corner of the lower left pixel, not its center.
     x, y = np.asarray(mosaic.raster.origin, np.float64) - 0.5 * resolution
@@ -133,18 +148,12 @@ def _write_map(built: Any, out: Path) -> None:
 
 
 def _write_path(times: np.ndarray, poses: np.ndarray, out: Path) -> None:
-    rows = []
-    for time, (x, y, heading) in zip(times, poses, strict=True):
-        matrix = np.eye(4)
-        matrix[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
-        matrix[:2, 3] = x, y
-        rows.append(tum.format_pose(float(time), matrix) + "\n")
+    rows = [tum.format_pose(float(time), planar_matrix(pose)) + "\n" for time, pose in zip(times, poses, strict=True)]
     write_file(out / "trajectory.tum", "".join(rows))
 
 
-def _announce(metrics: dict[str, Any], out: Path) -> None:
-    words = [f"{metrics['pictures_used']} of {metrics['images']} images joined"]
+def _summary(metrics: dict[str, Any]) -> str:
+    words = [f"{metrics['images_used']} of {metrics['images']} images joined"]
     if metrics["left_out"]:
         words.append("left out: " + ", ".join(metrics["left_out"][:5]) + (", ..." * (len(metrics["left_out"]) > 5)))
-    words.append(f"{metrics['loop_closures']} loop closures")
-    typer.echo(f"{'; '.join(words)}: {out / 'report.html'}")
+    return "; ".join([*words, f"{metrics['loop_closures']} loop closures"])

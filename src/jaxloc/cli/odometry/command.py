@@ -1,29 +1,36 @@
-"""``jaxloc odometry`` and ``jaxloc demo``: run the pipeline, write its rows as they come, then metrics and report."""
+"""``jaxloc odometry`` and ``jaxloc demo``: stereo odometry of a recording, or of a synthetic street."""
 
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import numpy as np
-import typer
 
-from jaxloc.cli import configuration, results, session
+from jaxloc.cli import lifecycle, session
+from jaxloc.cli.lifecycle import Arguments
 from jaxloc.cli.odometry import report
-from jaxloc.cli.track.stereo import command
-from jaxloc.data import DataError, StereoFrame, StereoSequence, covariance, kitti, simulate_street, tum
+from jaxloc.cli.track.stereo import command as stereo
+from jaxloc.data import StereoSequence, covariance, kitti, simulate_street, tum
 from jaxloc.data.io.writing import RowWriter
 
+_FILES = {"trajectory.txt": None, "trajectory.tum": None, "covariance.csv": covariance.HEADER}
 
-def run_recording(folder: Path, poses: Path | None, out: Path, config_path: Path | None) -> int:
+
+def default_config() -> Any:
+    """The default options."""
+    from jaxloc.pipelines import odometry
+
+    return odometry.Config()
+
+
+def run_recording(folder: Path, poses: Path | None, arguments: Arguments) -> int:
     """Runs odometry on a recording.
 
     Args:
         folder: KITTI sequence.
         poses: true poses.
-        out: folder for the results.
-        config_path: YAML file with options.
+        arguments: output folder and options.
 
     Returns:
         The exit code.
@@ -31,22 +38,22 @@ def run_recording(folder: Path, poses: Path | None, out: Path, config_path: Path
     Raises:
         DataError: when any input is bad; nothing is written then.
     """
+    lifecycle.prepare(arguments.out)
     sequence = kitti.read_sequence(folder, poses)
-    config = _prepare(out, config_path)
+    config = arguments.read(default_config())
     with session.show_progress("checking images", len(sequence)) as progress:
         sequence.verify(progress)
     inputs = {"command": "odometry", "sequence": str(folder), "poses": None if poses is None else str(poses)}
-    return _run(sequence, config, out, inputs, title=f"Stereo odometry: {sequence.name}")
+    return _run(sequence, config, arguments.out, inputs, title=f"Stereo odometry: {sequence.name}")
 
 
-def run_demo(out: Path, config_path: Path | None, *, num_frames: int, seed: int) -> int:
+def run_demo(arguments: Arguments, *, num_frames: int, seed: int) -> int:
     """Runs odometry on a synthetic street, then the tracker of moving objects, which writes to ``moving_objects``.
 
     Args:
-        out: folder for the results.
-        config_path: YAML file with options.
-        num_frames: how many frames.
-        seed: which street.
+        arguments: output folder and options.
+        num_frames: number of frames.
+        seed: of the street.
 
     Returns:
         The exit code.
@@ -54,79 +61,37 @@ def run_demo(out: Path, config_path: Path | None, *, num_frames: int, seed: int)
     Raises:
         DataError: when any input is bad; nothing is written then.
     """
-    config = _prepare(out, config_path)
+    out = arguments.out
+    lifecycle.prepare(out)
+    config = arguments.read(default_config())
     sequence = simulate_street(num_frames=num_frames, seed=seed)
     inputs = {"command": "demo", "frames": num_frames, "seed": seed}
     code = _run(sequence, config, out, inputs, title="Stereo odometry on a synthetic street")
     if code:
         return code
-    from jaxloc.pipelines import moving_objects
-
-    objects = eqx.tree_at(lambda c: c.odometry, moving_objects.Config(), config)
+    objects = eqx.tree_at(lambda c: c.odometry, stereo.default_config(), config)
     title = "Moving objects on a synthetic street"
-    return command.run_sequence(sequence, objects, out / "moving_objects", inputs, title=title)
-
-
-def _prepare(out: Path, config_path: Path | None) -> Any:
-    """Checks all that can fail before the run: the output folder, the options, the libraries for the report."""
-    results.prepare(out)
-    from jaxloc.pipelines import odometry
-
-    default = odometry.Config()
-    return default if config_path is None else configuration.read_config(config_path, default)
+    return stereo.run_sequence(sequence, objects, out / "moving_objects", inputs, title=title)
 
 
 def _run(sequence: StereoSequence, config: Any, out: Path, inputs: dict[str, Any], *, title: str) -> int:
-    record = report.Record(title, sequence)
-    with session.Interruption() as interruption, session.output_folder(out):
-        _stream(sequence, config, out, record, interruption)
-        record.interrupted = interruption.requested
-        metrics = results.write(record, config, out, inputs)
-    _announce(metrics, out)
-    return 130 if record.interrupted else 0
-
-
-def _stream(
-    sequence: StereoSequence,
-    config: Any,
-    out: Path,
-    record: report.Record,
-    interruption: session.Interruption,
-) -> None:
-    """Writes a row of every file for each frame, until the end or an interrupt."""
     from jaxloc.pipelines import odometry
 
-    with ExitStack() as stack:
-        poses = stack.enter_context(RowWriter(out / "trajectory.txt"))
-        stamped = stack.enter_context(RowWriter(out / "trajectory.tum"))
-        covariances = stack.enter_context(RowWriter(out / "covariance.csv", covariance.HEADER))
-        progress = stack.enter_context(session.show_progress("odometry", len(sequence)))
-        for index, step in enumerate(odometry.steps(_until(sequence, interruption), sequence.rig, config)):
-            matrix = np.asarray(step.pose.matrix(), dtype=np.float64)
-            poses.append(kitti.format_pose(matrix))
-            stamped.append(tum.format_pose(float(step.time), matrix))
-            covariances.append(covariance.format_covariance(index, step.covariance))
-            record.add(step, matrix)
-            progress(index + 1)
-            if interruption.requested:
-                break
-        if not record.matrices:
-            if interruption.requested:
-                raise typer.Abort  # nothing was estimated: leave nothing behind
-            raise DataError(sequence.name, "the pipeline gave no pose")
+    record = report.Record(title, sequence)
+
+    def write(output: Any, rows: Mapping[str, RowWriter]) -> None:
+        matrix = np.asarray(output.pose.matrix(), dtype=np.float64)
+        rows["trajectory.txt"].append(kitti.format_pose(matrix))
+        rows["trajectory.tum"].append(tum.format_pose(float(output.time), matrix))
+        rows["covariance.csv"].append(covariance.format_covariance(len(record.matrices), output.covariance))
+        record.add(output, matrix)
+
+    with lifecycle.open_run(out) as run:
+        outputs = odometry.run(sequence, config, sequence.rig)
+        run.stream(outputs, write, title="odometry", total=len(sequence), files=_FILES)
+        return run.finish(record, config, inputs, _summary)
 
 
-def _until(sequence: StereoSequence, interruption: session.Interruption) -> Iterator[StereoFrame]:
-    for frame in sequence:
-        if interruption.requested:
-            return
-        yield frame
-
-
-def _announce(metrics: dict[str, Any], out: Path) -> None:
-    words = [f"{metrics['frames']} frames, {metrics['distance_m']:.1f} m"]
-    if "end_drift_percent" in metrics:
-        words.append(f"drift {metrics['end_drift_percent']:.2f} %")
-    if metrics["interrupted"]:
-        words.append("interrupted")
-    typer.echo(f"{', '.join(words)}: {out / 'report.html'}")
+def _summary(metrics: dict[str, Any]) -> str:
+    text = f"{metrics['frames']} frames, {metrics['distance_m']:.1f} m"
+    return f"{text}, drift {metrics['end_drift_percent']:.2f} %" if "end_drift_percent" in metrics else text

@@ -1,4 +1,4 @@
-"""What a run of the odometry says of itself: numbers for metrics.json and the page of the report."""
+"""Metrics and report of stereo odometry."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ _PROBABILITIES = (0.5, 0.9, 0.95)
 
 
 class Record:
-    """What a run has given so far.
+    """Outputs of a run so far.
 
     Args:
         title: of the report.
@@ -30,26 +30,26 @@ class Record:
         self.sequence = sequence
         self.interrupted = False
         self.matrices: list[np.ndarray] = []
-        self.steps: list[Any] = []
+        self.outputs: list[Any] = []
         self._shown: tuple[int, Any] | None = None
 
-    def add(self, step: Any, matrix: np.ndarray) -> None:
+    def add(self, output: Any, matrix: np.ndarray) -> None:
         """Adds a frame.
 
         Args:
-            step: what the pipeline gave.
+            output: of the pipeline.
             matrix: ``T_world_camera``.
         """
         index = len(self.matrices)
         self.matrices.append(matrix)
-        self.steps.append(_Numbers(step))
+        self.outputs.append(_Numbers(output))
         # Matches of one frame are shown: that in the middle of the recording, or the last one before it.
-        if step.num_matches > 0 and index <= max(len(self.sequence) // 2, 1):
-            self._shown = (index, step)
+        if output.num_matches > 0 and index <= max(len(self.sequence) // 2, 1):
+            self._shown = (index, output)
 
     def estimate(self) -> Trajectory:
         """The estimated path."""
-        times = np.array([step.time for step in self.steps])
+        times = np.array([output.time for output in self.outputs])
         return Trajectory.from_matrices(jnp.asarray(times), jnp.asarray(np.stack(self.matrices)))
 
     def truth(self) -> Trajectory | None:
@@ -67,27 +67,29 @@ class Record:
 
     def covariances(self) -> np.ndarray:
         """Covariances of the poses."""
-        return np.stack([step.covariance for step in self.steps])
+        return np.stack([output.covariance for output in self.outputs])
 
     def stages(self) -> dict[str, np.ndarray]:
-        """Seconds by stage; the first two frames, which compile, are left out where there are more."""
-        skip = 2 if len(self.steps) > 4 else 0
-        names = dict.fromkeys(name for step in self.steps for name in step.timings)
-        times = {name: [step.timings[name] for step in self.steps[skip:] if name in step.timings] for name in names}
+        """Wall time by stage, s, without the first two frames, which compile, where there are more than four."""
+        skip = 2 if len(self.outputs) > 4 else 0
+        names = dict.fromkeys(name for output in self.outputs for name in output.timings)
+        times = {
+            name: [output.timings[name] for output in self.outputs[skip:] if name in output.timings] for name in names
+        }
         return {name: np.array(values) for name, values in times.items() if values}
 
     def metrics(self) -> dict[str, Any]:
         """The numbers of metrics.json: SI units, or the unit in the name."""
-        matches = [step for step in self.steps if step.num_matches > 0]
+        matches = [output for output in self.outputs if output.num_matches > 0]
         stages = self.stages()
         numbers: dict[str, Any] = {
-            "frames": len(self.steps),
+            "frames": len(self.outputs),
             "frames_of_sequence": len(self.sequence),
             "interrupted": self.interrupted,
-            "frames_not_ok": sum(not step.ok for step in self.steps),
+            "frames_not_ok": sum(not output.ok for output in self.outputs),
             "distance_m": self.distance(),
-            "median_matches": float(np.median([step.num_matches for step in matches])) if matches else 0.0,
-            "median_inliers": float(np.median([step.num_inliers for step in matches])) if matches else 0.0,
+            "median_matches": float(np.median([one.num_matches for one in matches])) if matches else 0.0,
+            "median_inliers": float(np.median([one.num_inliers for one in matches])) if matches else 0.0,
             "median_stage_seconds": {name: float(np.median(times)) for name, times in stages.items()},
             "median_frame_seconds": float(sum(np.median(times) for times in stages.values())),
         }
@@ -98,10 +100,10 @@ class Record:
 
     def _accuracy(self, truth: Trajectory) -> dict[str, Any]:
         lengths = kitti_drift.fitting_lengths(float(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1).sum()))
-        # On short paths every frame starts a stretch, on long ones every tenth, as in the benchmark.
+        # On short paths every frame begins a segment, on long ones every tenth, as in the benchmark.
         step = 10 if lengths[:1] == kitti_drift.KITTI_LENGTHS[:1] else 1
         motions, covariances = (
-            jnp.asarray(np.stack([getattr(step, name) for step in self.steps[1:]]), truth.times.dtype)
+            jnp.asarray(np.stack([getattr(output, name) for output in self.outputs[1:]]), truth.times.dtype)
             for name in ("relative", "relative_covariance")
         )
         values = _compare(self.estimate(), truth, motions, covariances, jnp.asarray(lengths or (1.0,)), step)
@@ -113,7 +115,7 @@ class Record:
         return numbers
 
     def page(self, metrics: dict[str, Any]) -> str:
-        """The page."""
+        """The report as HTML."""
         estimate, truth = self.estimate(), self.truth()
         covariances = self.covariances()
         path = plots.draw_trajectory(estimate, truth, covariances)
@@ -122,9 +124,9 @@ class Record:
         if truth is not None and len(truth) > 1:
             distances = np.asarray(trajectories.path_distances(truth.positions))
             curve = plots.draw_drift(distances, np.asarray(kitti_drift.drift_curve_percent(estimate, truth)))
-            text = "Distance between the estimated and the true position, as a fraction of the way so far."
+            text = "Distance between the estimated and the true position, as a fraction of the distance so far."
             sections.append(report.Section("Drift", text, curve))
-        text = "Three standard deviations of the position as the estimator sees them, in camera axes"
+        text = "Three standard deviations of the estimated position, in camera axes"
         text += ", and the actual error." if truth is not None else "."
         uncertainty = plots.draw_ellipses(estimate, covariances, truth)
         sections.append(report.Section("Uncertainty", text, uncertainty))
@@ -139,30 +141,30 @@ class Record:
     def _matches(self) -> list[report.Section]:
         if self._shown is None:
             return []
-        index, step = self._shown
+        index, output = self._shown
         image = self.sequence[index].left
         figure = plots.draw_matches(
             image,
-            np.asarray(step.uv_previous, dtype=np.float64),
-            np.asarray(step.uv_current, dtype=np.float64),
-            np.asarray(step.inlier, dtype=bool),
+            np.asarray(output.uv_previous, dtype=np.float64),
+            np.asarray(output.uv_current, dtype=np.float64),
+            np.asarray(output.inlier, dtype=bool),
         )
-        text = f"Frame {index}: lines lead from where a feature was in the frame before to where it is."
+        text = f"Frame {index}: lines lead from a feature's position in the keyframe to its position in this frame."
         return [report.Section("Matches", text, figure, raster=True)]
 
 
 class _Numbers:
-    """The numbers of a step, on the host; its images of matches are dropped."""
+    """The numbers of an output, without its matches."""
 
-    def __init__(self, step: Any):
-        self.time = float(step.time)
-        self.covariance = np.asarray(step.covariance, dtype=np.float64)
-        self.relative = np.asarray(step.relative.matrix(), dtype=np.float64)
-        self.relative_covariance = np.asarray(step.relative_covariance, dtype=np.float64)
-        self.ok = bool(step.ok)
-        self.num_inliers = int(step.num_inliers)
-        self.num_matches = int(step.num_matches)
-        self.timings = {name: float(value) for name, value in step.timings.items()}
+    def __init__(self, output: Any):
+        self.time = float(output.time)
+        self.covariance = np.asarray(output.covariance, dtype=np.float64)
+        self.relative = np.asarray(output.relative.matrix(), dtype=np.float64)
+        self.relative_covariance = np.asarray(output.relative_covariance, dtype=np.float64)
+        self.ok = bool(output.ok)
+        self.num_inliers = int(output.num_inliers)
+        self.num_matches = int(output.num_matches)
+        self.timings = {name: float(value) for name, value in output.timings.items()}
 
 
 @eqx.filter_jit
@@ -204,5 +206,4 @@ def _highlights(metrics: dict[str, Any]) -> tuple[report.Highlight, ...]:
         ("median_inliers", "inliers a frame", "{:.0f}"),
         ("median_frame_seconds", "time a frame", "{:.3f} s"),
     )
-    shown = [(label, form.format(metrics[name])) for name, label, form in wanted if metrics.get(name) is not None]
-    return tuple(report.Highlight(label, value) for label, value in shown)
+    return results.highlights(metrics, wanted)

@@ -8,7 +8,7 @@
     calib/0001.txt                   P0: ... P3:, R0_rect, Tr_velo_to_cam, Tr_imu_to_velo
     orbslam3_poses/0001.txt          optional: 12 numbers a line, the rows of T_world_camera
 
-Positions are those of the middle of an object's bottom, in the rectified frame of camera 0.
+Positions are those of the center of an object's bottom, in the rectified frame of camera 0.
 
 References:
     Geiger, Lenz and Urtasun, "Are we ready for autonomous driving?", CVPR 2012. [T-44]
@@ -23,7 +23,7 @@ from jaxtyping import Float64
 
 from jaxloc.data.io.errors import DataError
 from jaxloc.data.io.text import check_rotations, parse_numbers, read_rows, read_text
-from jaxloc.data.tracking.records import Detections, LabelledTracks, Rows, assemble, assemble_tracks, check_frame
+from jaxloc.data.tracking.records import Detections, LabeledTracks, Rows, assemble, assemble_tracks, check_frame
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person", "Cyclist", "Tram", "Misc")
 _ALIASES = {"Person_sitting": "Person"}
@@ -63,19 +63,19 @@ class KittiTracking(eqx.Module):
     calibration: KittiCalibration
     poses: Float64[np.ndarray, "t 4 4"] | None
     detections: Detections
-    truth: LabelledTracks
+    truth: LabeledTracks
 
 
 def read_kitti_tracking(
     folder: Path | str, name: str, *, detector: str = "det_pointrcnn_Car", types: tuple[str, ...] = ("Car",)
 ) -> KittiTracking:
-    """Reads a sequence: all that is known but the images.
+    """Reads a sequence without its images.
 
     Args:
         folder: with the folders named above.
         name: of the sequence, such as ``0001``.
         detector: folder of the detections.
-        types: of labels that count.
+        types: of labels that are read.
 
     Returns:
         The sequence; as long as its poses, or as the longer of labels and detections.
@@ -105,20 +105,21 @@ def read_labels(
     types: tuple[str, ...] = ("Car",),
     num_frames: int | None = None,
     poses: Float64[np.ndarray, "t 4 4"] | None = None,
-) -> LabelledTracks:
-    """Reads true tracks; regions that do not matter (``DontCare``) are left out.
+) -> LabeledTracks:
+    """Reads true tracks; regions marked ``DontCare`` are left out.
 
     Args:
         path: the file.
-        types: that count, of `TYPES`.
-        num_frames: how many frames there are; up to the last line that counts where not given.
+        types: that are read, of `TYPES`.
+        num_frames: how many frames there are; up to the last line that is read where not given.
         poses: T_world_camera of each frame; the identity where not given.
 
     Returns:
         The tracks; the types of their detections are rows of `types`.
 
     Raises:
-        DataError: when the file is missing, a line is broken or of a type unknown, or an identity is twice in a frame.
+        DataError: the file is missing, a line is malformed or of an unknown type, or an identity occurs twice in a
+            frame.
     """
     unknown = set(types) - set(TYPES)
     if unknown:
@@ -132,7 +133,7 @@ def read_labels(
             raise DataError(path, f"line {line} has {len(words)} words, needs 17")
         kind = _ALIASES.get(words[2], words[2])
         if kind != _IGNORED and kind not in TYPES:
-            raise DataError(path, f"line {line}: {kind} is no type of object")
+            raise DataError(path, f"line {line}: {kind} is an unknown type of object")
         values = parse_numbers(path, line, words[:2] + words[3:], 16)
         check_frame(path, line, values[0], first=0)
         if kind in types:
@@ -154,21 +155,21 @@ def read_detections(
     capacity: int | None = None,
     poses: Float64[np.ndarray, "t 4 4"] | None = None,
 ) -> Detections:
-    """Reads what a detector of AB3DMOT's format found.
+    """Reads detections in AB3DMOT's format.
 
-    Detections with numbers that are not finite are left out and counted.
+    Detections with non-finite values are left out and counted.
 
     Args:
         path: the file.
         num_frames: how many frames there are; up to the last line where not given.
-        capacity: room of a frame; the surest stay.
+        capacity: slots of a frame; the highest scores are kept.
         poses: T_world_camera of each frame; the identity where not given.
 
     Returns:
         The detections; their types are those of `TYPES`.
 
     Raises:
-        DataError: when the file is missing, or a line is broken or of a class unknown.
+        DataError: when the file is missing, or a line is malformed or of an unknown class.
     """
     rows, lines = [], []
     for line, text in enumerate(read_text(path).splitlines(), start=1):
@@ -189,8 +190,8 @@ def read_detections(
     values = np.array(rows, dtype=np.float64).reshape(len(rows), 15)
     kinds = np.array([TYPES.index(_CLASSES[int(value)]) for value in values[:, 1]], dtype=np.int64)
     frames = values[:, 0].astype(np.int64)
-    boxes, scores, solids = values[:, 2:6], values[:, 6], values[:, 7:14]
-    table = Rows(np.array(lines, dtype=np.int64), frames, boxes, scores, None, kinds, solids)
+    boxes, scores, objects = values[:, 2:6], values[:, 6], values[:, 7:14]
+    table = Rows(np.array(lines, dtype=np.int64), frames, boxes, scores, None, kinds, objects)
     return assemble(path, table, rate=_RATE, num_frames=num_frames, capacity=capacity, names=TYPES, poses=poses)
 
 
@@ -204,7 +205,7 @@ def read_camera_poses(path: Path | str) -> Float64[np.ndarray, "t 4 4"]:
         Matrices, in the precision of the file.
 
     Raises:
-        DataError: when the file is missing, a line is broken, or a block is no rotation.
+        DataError: when the file is missing, a line is malformed, or a block is no rotation.
     """
     rows = read_rows(path, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -214,7 +215,7 @@ def read_camera_poses(path: Path | str) -> Float64[np.ndarray, "t 4 4"]:
 
 
 def read_calibration(path: Path | str) -> KittiCalibration:
-    """Reads the cameras of a sequence, under either of the names that are in use.
+    """Reads the cameras of a sequence, under either of the names in use.
 
     Args:
         path: the file.

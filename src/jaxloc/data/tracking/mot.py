@@ -1,7 +1,9 @@
-"""Boxes of the MOT challenge: ``frame, id, left, top, width, height, score, x, y, z`` (or class and visibility).
+"""Detections and tracks of the MOT challenge: boxes in images.
+
+Columns: ``frame, id, left, top, width, height, score, x, y, z`` (or class and visibility).
 
 Frames count from 1; commas or spaces separate. The detector's identities are -1 and are not read; true rows of score 0
-do not count.
+are ignored.
 
 References:
     Leal-Taixe et al., "MOTChallenge 2015: towards a benchmark for multi-target tracking", arXiv 1504.01942.
@@ -16,7 +18,7 @@ from jaxtyping import Float64, Int64
 from jaxloc.data.io.errors import DataError
 from jaxloc.data.io.text import read_text
 from jaxloc.data.io.writing import write_file
-from jaxloc.data.tracking.records import Detections, LabelledTracks, Rows, assemble, assemble_tracks, check_frame
+from jaxloc.data.tracking.records import Detections, LabeledTracks, Rows, assemble, assemble_tracks, check_frame
 
 _FEWEST, _MOST = 7, 10
 
@@ -24,27 +26,27 @@ _FEWEST, _MOST = 7, 10
 def read_mot_detections(
     path: Path | str, *, num_frames: int | None = None, capacity: int | None = None, rate: float = 25.0
 ) -> Detections:
-    """Reads what a detector found (``det.txt``).
+    """Reads detections (``det.txt``).
 
-    Detections with numbers that are not finite, or boxes without area, are left out and counted.
+    Detections with non-finite values, or boxes without area, are left out and counted.
 
     Args:
         path: the file.
         num_frames: how many frames there are; up to the last line where not given.
-        capacity: room of a frame; the surest stay.
+        capacity: slots of a frame; the highest scores are kept.
         rate: frames a second.
 
     Returns:
         The detections.
 
     Raises:
-        DataError: when the file is missing, or a line is broken.
+        DataError: when the file is missing, or a line is malformed.
     """
     rows = _rows(*_read(path))
     return assemble(path, rows, rate=rate, first=1, num_frames=num_frames, capacity=capacity)
 
 
-def read_mot_tracks(path: Path | str, *, num_frames: int | None = None, rate: float = 25.0) -> LabelledTracks:
+def read_mot_tracks(path: Path | str, *, num_frames: int | None = None, rate: float = 25.0) -> LabeledTracks:
     """Reads true tracks (``gt.txt``), or those of a tracker.
 
     Args:
@@ -56,7 +58,7 @@ def read_mot_tracks(path: Path | str, *, num_frames: int | None = None, rate: fl
         The tracks.
 
     Raises:
-        DataError: when the file is missing, a line is broken, or an identity is there twice in a frame.
+        DataError: when the file is missing, a line is malformed, or an identity occurs twice in a frame.
     """
     values, lines = _read(path)
     for identity, line in zip(values[:, 1], lines, strict=True):
@@ -67,7 +69,7 @@ def read_mot_tracks(path: Path | str, *, num_frames: int | None = None, rate: fl
     return assemble_tracks(path, rows, rate=rate, first=1, num_frames=num_frames)
 
 
-def write_mot(path: Path | str, tracks: LabelledTracks) -> None:
+def write_mot(path: Path | str, tracks: LabeledTracks) -> None:
     r"""Writes tracks as a result file of the benchmark, in one step.
 
     Args:
@@ -104,7 +106,7 @@ def _rows(
 
 
 def _read(path: Path | str) -> tuple[Float64[np.ndarray, "n 7"], Int64[np.ndarray, " n"]]:
-    """The first seven numbers of each line, and the lines they stand in."""
+    """The first seven numbers of each line, and its line number."""
     rows, lines = [], []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.replace(",", " ").split()

@@ -1,7 +1,7 @@
-"""What a detector found in each frame, and what was really there: one record for all formats of files.
+"""Detections and labeled tracks by frame: one record for all file formats.
 
-Every frame has the same room; `valid` says which slots count, and the others hold zeros. Frames that a file does not
-name are empty. Host code: arrays are NumPy's.
+Every frame has the same number of slots; `valid` marks those that hold a detection, and the others hold zeros. Frames
+without a row in the file are empty. Host code: arrays are NumPy's.
 """
 
 from pathlib import Path
@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float64, Int64
 
 from jaxloc.data.io.errors import DataError
 
-_MOST_FRAMES = 10**6  # a frame number beyond this is a broken line
+_MOST_FRAMES = 10**6  # a greater frame number is an error in the file
 
 
 class Detections(eqx.Module):
-    """Detections by frame, "t m": those of a frame stand first, the surest one first of all.
+    """Detections by frame, "t m": sorted by score within each frame, the highest first.
 
     Attributes:
         frames: numbers of the frames.
@@ -26,9 +26,9 @@ class Detections(eqx.Module):
         scores: of the detector, in its own units.
         types: rows of `names`; -1 where not valid.
         names: of the types.
-        left_out: how many of a frame were not used: bad numbers, boxes without area, no room.
-        camera: positions in the rectified frame of camera 0 (x right, y down, z forward), m; None for images alone.
-        positions: the same in the world, the frame of the first camera pose, m.
+        left_out: number of rows of a frame that were not used: non-finite values, boxes without area, no slot.
+        camera: positions in the rectified frame of camera 0 (x right, y down, z forward), m; None for boxes in images.
+        positions: in the world, the frame of the first camera pose, m.
         sizes: height, width, length, m.
         headings: direction of the length in the world, rad: from the world's x axis towards its -z axis.
     """
@@ -50,7 +50,7 @@ class Detections(eqx.Module):
         return len(self.frames)
 
     def select(self, kept: Bool[np.ndarray, "t m"]) -> "Detections":
-        """The same with fewer valid slots, such as those of a score; nothing moves.
+        """A copy with fewer valid slots, such as those above a score; indices stay.
 
         Example:
             >>> import jaxloc as jl, numpy as np
@@ -64,16 +64,16 @@ class Detections(eqx.Module):
 
 
 class Rows(eqx.Module):
-    """What a file says, row by row.
+    """Rows of a file.
 
     Attributes:
-        lines: of the file, counted from 1.
+        lines: line numbers in the file, from 1.
         frames: numbers of the frames.
         boxes: left, top, right, bottom.
-        scores: the larger, the surer.
-        ids: who it is, where that is known.
+        scores: of the detector; 1 for true tracks.
+        ids: identities, where they are known.
         types: rows of the names of the types.
-        solids: height, width, length, x, y, z (camera), rotation about the camera's y axis.
+        objects: height, width, length, x, y, z (camera), rotation about the camera's y axis.
     """
 
     lines: Int64[np.ndarray, " n"]
@@ -82,45 +82,45 @@ class Rows(eqx.Module):
     scores: Float64[np.ndarray, " n"]
     ids: Int64[np.ndarray, " n"] | None = None
     types: Int64[np.ndarray, " n"] | None = None
-    solids: Float64[np.ndarray, "n 7"] | None = None
+    objects: Float64[np.ndarray, "n 7"] | None = None
 
     def usable(self) -> Bool[np.ndarray, " n"]:
-        """Rows whose numbers are finite; boxes need an area, but for solids, which may lie outside the image."""
+        """Rows with finite values; boxes without 3-D objects need a positive area."""
         good = np.isfinite(self.boxes).all(axis=1) & np.isfinite(self.scores)
-        if self.solids is not None:
-            return good & np.isfinite(self.solids).all(axis=1)
+        if self.objects is not None:
+            return good & np.isfinite(self.objects).all(axis=1)
         return good & (self.boxes[:, 2] > self.boxes[:, 0]) & (self.boxes[:, 3] > self.boxes[:, 1])
 
 
-class LabelledTracks(eqx.Module):
-    """Detections whose identity is known: true tracks, or those of a tracker.
+class LabeledTracks(eqx.Module):
+    """Detections with identities: true tracks, or those of a tracker.
 
     Attributes:
-        detections: what is there.
-        ids: "t m" who it is; -1 where not valid.
+        detections: by frame.
+        ids: "t m" identities; -1 where not valid.
     """
 
     detections: Detections
     ids: Int64[np.ndarray, "t m"]
 
     def identities(self) -> Int64[np.ndarray, " n"]:
-        """Who is there at all, in order."""
+        """All identities, in ascending order."""
         return np.unique(self.ids[self.detections.valid])
 
     def slots(self) -> tuple[Int64[np.ndarray, "n t"], Bool[np.ndarray, "n t"]]:
-        """Where each identity stands in each frame: its slot, and whether it is there."""
+        """Slot of each identity in each frame, and whether it is present."""
         present = self.detections.valid[None] & (self.ids[None] == self.identities()[:, None, None])
         if not present.size:
             return np.zeros(present.shape[:2], np.int64), np.zeros(present.shape[:2], bool)
         return present.argmax(axis=2), present.any(axis=2)
 
     def by_identity(self, values: Float64[np.ndarray, "t m *d"]) -> Float64[np.ndarray, "n t *d"]:
-        """A field of the detections as tracks: by identity, then by frame; zero where it is not there."""
-        slots, there = self.slots()
+        """A field of the detections by identity, then by frame; zero where the identity is not present."""
+        slots, present = self.slots()
         if not values.shape[1]:
             return np.zeros((*slots.shape, *values.shape[2:]))
         picked = values[np.arange(values.shape[0])[None], slots]
-        return np.where(there.reshape(*there.shape, *(1,) * (values.ndim - 2)), picked, 0.0)
+        return np.where(present.reshape(*present.shape, *(1,) * (values.ndim - 2)), picked, 0.0)
 
 
 def assemble(
@@ -134,7 +134,7 @@ def assemble(
     names: tuple[str, ...] = ("object",),
     poses: Float64[np.ndarray, "t 4 4"] | None = None,
 ) -> Detections:
-    """Puts rows of a file into frames; rows that are not usable, or find no room, are left out and counted.
+    """Sorts rows of a file into frames; rows that are not usable, or exceed the capacity, are left out and counted.
 
     Args:
         path: the file, for errors.
@@ -142,7 +142,7 @@ def assemble(
         rate: frames a second.
         first: number of the first frame.
         num_frames: how many frames there are; up to the last row where not given.
-        capacity: room of a frame; that of the fullest where not given. The surest stay.
+        capacity: slots of a frame; those of the fullest frame where not given. The highest scores are kept.
         names: of the types.
         poses: T_world_camera of each frame; the identity where not given.
 
@@ -160,12 +160,12 @@ def assemble(
         first + np.arange(count),
         np.arange(count) / rate,
         valid,
-        _spread(rows.boxes, table),
-        _spread(rows.scores, table),
-        np.where(valid, _spread(types, table), -1),
+        _scatter(rows.boxes, table),
+        _scatter(rows.scores, table),
+        np.where(valid, _scatter(types, table), -1),
         names,
         np.bincount(rows.frames - first, minlength=count) - valid.sum(axis=1),
-        *(() if rows.solids is None else _solids(path, _spread(rows.solids, table), valid, poses)),
+        *(() if rows.objects is None else _world_objects(path, _scatter(rows.objects, table), valid, poses)),
     )
 
 
@@ -178,8 +178,8 @@ def assemble_tracks(
     num_frames: int | None = None,
     names: tuple[str, ...] = ("object",),
     poses: Float64[np.ndarray, "t 4 4"] | None = None,
-) -> LabelledTracks:
-    """The same for rows with identities, all of which must be usable.
+) -> LabeledTracks:
+    """Sorts rows with identities into frames; all rows must be usable.
 
     Args:
         path: the file, for errors.
@@ -194,7 +194,7 @@ def assemble_tracks(
         The tracks.
 
     Raises:
-        DataError: as `assemble`, and when a row is not usable, or an identity is there twice in a frame.
+        DataError: as `assemble`, and when a row is not usable, or an identity occurs twice in a frame.
     """
     if rows.ids is None:
         raise ValueError("Tracks need rows with identities.")
@@ -205,26 +205,26 @@ def assemble_tracks(
     again = np.setdiff1d(np.arange(len(pairs)), np.unique(pairs, axis=0, return_index=True)[1])
     if again.size:
         frame, identity = pairs[again[0]]
-        raise DataError(path, f"line {rows.lines[again[0]]}: identity {identity} is there twice in frame {frame}")
+        raise DataError(path, f"line {rows.lines[again[0]]}: identity {identity} occurs twice in frame {frame}")
     found = assemble(path, rows, rate=rate, first=first, num_frames=num_frames, names=names, poses=poses)
     table = _table(path, rows, first, num_frames, None)
-    return LabelledTracks(found, np.where(found.valid, _spread(rows.ids, table), -1))
+    return LabeledTracks(found, np.where(found.valid, _scatter(rows.ids, table), -1))
 
 
 def check_frame(path: Path | str, line: int, value: float, first: int) -> int:
-    """The number of a frame.
+    """Checks the number of a frame.
 
     Args:
         path: the file, for the error.
         line: of the file, for the error.
-        value: what stands there.
+        value: the number in the file.
         first: number of the first frame.
 
     Returns:
         The number.
 
     Raises:
-        DataError: when it is none.
+        DataError: it is not whole, too small or too large.
     """
     if not (first <= value < _MOST_FRAMES and value == int(value)):
         raise DataError(path, f"line {line}: {value:g} is no frame number (whole, from {first})")
@@ -234,7 +234,7 @@ def check_frame(path: Path | str, line: int, value: float, first: int) -> int:
 def _table(
     path: Path | str, rows: Rows, first: int, num_frames: int | None, capacity: int | None
 ) -> Int64[np.ndarray, "t m"]:
-    """The row in each slot of each frame; -1 where there is none."""
+    """Index of the row in each slot of each frame; -1 where there is none."""
     frames = rows.frames - first
     last = int(frames.max(initial=-1))
     count = last + 1 if num_frames is None else num_frames
@@ -252,28 +252,28 @@ def _table(
     return table
 
 
-def _spread(values: np.ndarray, table: Int64[np.ndarray, "t m"]) -> np.ndarray:
+def _scatter(values: np.ndarray, table: Int64[np.ndarray, "t m"]) -> np.ndarray:
     """Values of rows in their slots; zero where there is none."""
-    spread = np.zeros((*table.shape, *values.shape[1:]), values.dtype)
-    spread[table >= 0] = values[table[table >= 0]]
-    return spread
+    table_values = np.zeros((*table.shape, *values.shape[1:]), values.dtype)
+    table_values[table >= 0] = values[table[table >= 0]]
+    return table_values
 
 
-def _solids(
+def _world_objects(
     path: Path | str,
-    solids: Float64[np.ndarray, "t m 7"],
+    objects: Float64[np.ndarray, "t m 7"],
     valid: Bool[np.ndarray, "t m"],
     poses: Float64[np.ndarray, "k 4 4"] | None,
 ) -> tuple[np.ndarray, ...]:
-    """Positions in the camera and in the world, sizes, and headings in the world."""
-    count = len(solids)
+    """Positions in the camera's frame and in the world, sizes, and headings in the world."""
+    count = len(objects)
     poses = np.tile(np.eye(4), (count, 1, 1)) if poses is None else poses
     if len(poses) < count:
         raise DataError(path, f"has {count} frames, but there are {len(poses)} poses")
     rotations, translations = poses[:count, :3, :3], poses[:count, :3, 3]
-    camera, turn = solids[..., 3:6], solids[..., 6]
+    camera, turn = objects[..., 3:6], objects[..., 6]
     world = np.einsum("tij,tmj->tmi", rotations, camera) + translations[:, None]
     along = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=-1)
     ahead = np.einsum("tij,tmj->tmi", rotations, along)
     headings = np.where(valid, np.arctan2(-ahead[..., 2], ahead[..., 0]), 0.0)
-    return camera, np.where(valid[..., None], world, 0.0), solids[..., :3], headings
+    return camera, np.where(valid[..., None], world, 0.0), objects[..., :3], headings

@@ -1,42 +1,76 @@
-"""Tracking of ready detections: 3-D objects or image boxes."""
+"""Tracking by detection: tracks of objects in the world, or of boxes in images."""
 
-from jaxloc.pipelines.detection_tracking import models, options, tracking
+from jaxloc.pipelines.detection_tracking import confirmation, models, options, tracking
+from jaxloc.pipelines.detection_tracking.confirmation import Identities, Output, Tracks, confirm, stack
 from jaxloc.pipelines.detection_tracking.models import (
-    Frame,
+    Control,
+    DetectionSensor,
+    Measurement,
+    MovingCameraTracker,
     Noise,
-    PlaceSensor,
     ScoredBirth,
     ScoredClutter,
     ScoredDetection,
-    Step,
-    WatchedTracker,
     is_in_view,
 )
-from jaxloc.pipelines.detection_tracking.options import Belief, Config, Gnn, Jpda, Movement, Phd, Scene, Strategy
-from jaxloc.pipelines.detection_tracking.tracking import Tracked, make_tracker, track
+from jaxloc.pipelines.detection_tracking.options import (
+    STRATEGIES,
+    Config,
+    Confirmation,
+    ExistenceStrategy,
+    Gnn,
+    Jpda,
+    Phd,
+    Scene,
+    Strategy,
+    TargetMotion,
+)
+from jaxloc.pipelines.detection_tracking.tracking import (
+    Frame,
+    State,
+    init,
+    make_tracker,
+    run,
+    split_frames,
+    step,
+    track,
+)
 
 __all__ = [
-    "Belief",
+    "STRATEGIES",
     "Config",
+    "Confirmation",
+    "Control",
+    "DetectionSensor",
+    "ExistenceStrategy",
     "Frame",
     "Gnn",
+    "Identities",
     "Jpda",
-    "Movement",
+    "Measurement",
+    "MovingCameraTracker",
     "Noise",
+    "Output",
     "Phd",
-    "PlaceSensor",
     "Scene",
     "ScoredBirth",
     "ScoredClutter",
     "ScoredDetection",
-    "Step",
+    "State",
     "Strategy",
-    "Tracked",
-    "WatchedTracker",
+    "TargetMotion",
+    "Tracks",
+    "confirm",
+    "confirmation",
+    "init",
     "is_in_view",
     "make_tracker",
     "models",
     "options",
+    "run",
+    "split_frames",
+    "stack",
+    "step",
     "track",
     "tracking",
 ]

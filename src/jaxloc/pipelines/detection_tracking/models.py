@@ -1,10 +1,9 @@
-"""What trackers assume of ready detections: how they err and score, where targets appear, and when they leave.
+"""Measurement, detection, clutter, birth and survival models of trackers whose input are a detector's outputs.
 
-A measurement is a place and the detector's score, one vector: (x, y, z, score) of a solid in the world, or (center x,
-center y, width, height, score) of a box in an image. The state of a target is that and its rates.
+A measurement is one vector: (x, y, z, score) of an object in the world, or (center x, center y, width, height, score)
+of a box in an image. The state of a target is these values and their rates.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -17,21 +16,21 @@ from jaxloc.beliefs import Gaussian, Sensor
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.tracking import Clutter, Detection, MeasuredBirth, PhdState, Targets, Tracker, TrackerInfo
 
-SOLID, BOX = 4, 5  # entries of a measurement
-LEAST = 0.02  # existence of targets that are looked at
-NEAREST = 1.0  # depth that a camera sees from, m
-_ALWAYS, _NEVER = 0.99, 0.01  # no detector is surer of itself
+POSITION, BOX = 4, 5  # entries of a measurement
+MIN_EXISTENCE = 0.02  # of targets that are extracted
+MIN_DEPTH = 1.0  # of the field of view, m
+_MAX_DETECTION, _MIN_DETECTION = 0.99, 0.01
 
 
 class Noise(eqx.Module):
-    """How detections err: standard deviations.
+    """Standard deviations of detections.
 
     Attributes:
-        across: of a solid's place across the camera's axis, m.
+        across: of an object's position perpendicular to the camera's axis, m.
         depth: along it, m.
-        growth_across: more across for each m of depth.
-        growth_depth: more along for each m of depth.
-        box: of a box's center and sides, as a part of its height.
+        growth_across: increase of `across` for each m of depth.
+        growth_depth: increase of `depth` for each m of depth.
+        box: of a box's center and sides, as a fraction of its height.
         score: of the score about its mean.
     """
 
@@ -43,11 +42,11 @@ class Noise(eqx.Module):
     score: float = 1.2
 
 
-class Frame(eqx.Module):
-    """What a detector made of an image.
+class Measurement(eqx.Module):
+    """Detections of one image, as the tracker takes them.
 
     Attributes:
-        values: measurements.
+        values: measurement vectors.
         camera: T_world_camera.
     """
 
@@ -55,20 +54,20 @@ class Frame(eqx.Module):
     camera: Float[Array, "*t 4 4"]
 
 
-class Step(eqx.Module):
-    """From one image to the next.
+class Control(eqx.Module):
+    """Time and camera motion from one image to the next.
 
     Attributes:
         dt: s.
-        camera: T_world_camera of the next one.
+        camera: T_world_camera of the next image.
     """
 
     dt: Float[Array, "*t"]
     camera: Float[Array, "*t 4 4"]
 
 
-class PlaceSensor(Sensor):
-    """The first entries of the state: solids err more the farther they are, boxes the larger they are.
+class DetectionSensor(Sensor):
+    """Measurement of the first entries of the state, with noise that grows with depth or with the size of the box.
 
     Args:
         noise: standard deviations.
@@ -76,7 +75,7 @@ class PlaceSensor(Sensor):
         size: entries of a measurement.
 
     Example:
-        >>> sensor = PlaceSensor(Noise(across=0.1, depth=0.2, growth_depth=0.01, score=2.0), jnp.eye(4), SOLID)
+        >>> sensor = DetectionSensor(Noise(across=0.1, depth=0.2, growth_depth=0.01, score=2.0), jnp.eye(4), POSITION)
         >>> sigmas = jnp.sqrt(jnp.diag(sensor.covariance(jnp.array([0.0, 0, 80, 5, 0, 0, 0, 0]), None)))
         >>> [round(float(sigma), 3) for sigma in sigmas]
         [0.196, 0.196, 1.0, 2.0]
@@ -87,16 +86,16 @@ class PlaceSensor(Sensor):
     size: int = eqx.field(static=True)
 
     def expect(self, state: Float[Array, " d"], measurement: Any) -> Float[Array, " z"]:
-        """The place and the score."""
+        """Position and score."""
         del measurement
         return state[: self.size]
 
     def linearize(self, state: Float[Array, " d"], measurement: Any) -> tuple[Float[Array, " z"], Float[Array, "z d"]]:
-        """The same, and that the sensor is linear."""
+        """Expected measurement and its constant Jacobian."""
         return self.expect(state, measurement), jnp.eye(self.size, state.shape[0], dtype=state.dtype)
 
     def covariance(self, state: Float[Array, " d"], measurement: Any) -> Float[Array, "z z"]:
-        """Of a place, by its depth or its height."""
+        """Covariance of the noise, by the depth of the object or the height of the box."""
         del measurement
         noise, camera = self.noise, self.camera.astype(state.dtype)
         if self.size == BOX:
@@ -113,11 +112,11 @@ class PlaceSensor(Sensor):
 
 
 class ScoredClutter(Clutter):
-    """False detections anywhere, the fewer the surer: scores above zero are distributed exponentially.
+    """Uniformly distributed false detections with exponentially distributed positive scores.
 
     Args:
         rate: expected number in a frame.
-        volume: of the places.
+        volume: of the space of positions or boxes.
         scale: mean of their scores.
     """
 
@@ -134,73 +133,74 @@ class ScoredClutter(Clutter):
 
 
 class ScoredDetection(Detection):
-    """Targets of high scores are seldom missed: ``p_D`` is logistic in the score.
+    """Probability of detection as a logistic function of the target's score.
 
     Args:
         base: log odds of detection at a score of zero.
-        slope: how they grow with the score.
-        place: of the score in the state.
+        slope: increase of the log odds with the score.
+        index: of the score in the state.
     """
 
     base: Float[Array, ""]
     slope: Float[Array, ""]
-    place: int = eqx.field(static=True)
+    index: int = eqx.field(static=True)
 
-    def __init__(self, base: Any, slope: Any, place: int):
-        (self.base, self.slope), self.place = as_floats(base, slope), place
+    def __init__(self, base: Any, slope: Any, index: int):
+        (self.base, self.slope), self.index = as_floats(base, slope), index
 
     def probability(self, state: Float[Array, " d"]) -> Float[Array, ""]:
         """Between 0.01 and 0.99."""
-        return _NEVER + (_ALWAYS - _NEVER) * jax.nn.sigmoid(self.base + self.slope * state[self.place])
+        odds = self.base + self.slope * state[self.index]
+        return _MIN_DETECTION + (_MAX_DETECTION - _MIN_DETECTION) * jax.nn.sigmoid(odds)
 
 
 class ScoredBirth(MeasuredBirth):
-    """Targets appear anywhere with any score, and rates about zero.
+    """Births uniformly distributed over positions and scores, with normally distributed rates of zero mean.
 
     Args:
         rate: expected number in a frame.
-        volume: of places times scores.
-        sensor: for the noise of the first measurement.
+        volume: of the space of positions or boxes, times the range of scores.
+        sensor: gives the noise of the first measurement.
         variances: of the rates.
     """
 
     rate: Float[Array, ""]
     volume: Float[Array, ""]
-    sensor: PlaceSensor
+    sensor: DetectionSensor
     variances: Float[Array, " r"]
 
-    def __init__(self, rate: Any, volume: Any, sensor: PlaceSensor, variances: Any):
+    def __init__(self, rate: Any, volume: Any, sensor: DetectionSensor, variances: Any):
         self.rate, self.volume = as_floats(rate, volume)
         self.sensor, self.variances = sensor, variances
 
     def seed(self, measurement: Float[Array, " z"]) -> Gaussian:
-        """The measurement, and rates that are unknown."""
+        """The measurement with its noise, and rates of zero mean."""
         mean = jnp.concatenate([measurement, jnp.zeros_like(self.variances)])
         noise = self.sensor.covariance(mean, measurement)
         return Gaussian(mean, jax.scipy.linalg.block_diag(noise, jnp.diag(self.variances)))
 
 
-class WatchedTracker(Tracker):
-    """A tracker with a camera that moves: targets out of its view are likely to be gone.
+class MovingCameraTracker(Tracker):
+    """A tracker of targets seen by a moving camera: survival is less likely out of its view.
 
-    Its controls are `Step` records, and its measurements `Frame` records.
+    Its controls are `Control` records, and its measurements `Measurement` records.
 
     Args:
-        inner: the tracker, of a model with a `PlaceSensor` and `ScoredBirth`.
-        stay: survival of targets that are out of view, on top of the model's.
+        inner: the tracker, of a model with a `DetectionSensor` and `ScoredBirth`.
+        survival: factor on the survival probability of targets that are out of view.
         half_view: tangent of the half angle of view; None where targets are never out of view.
     """
 
     inner: Tracker
-    stay: float = eqx.field(static=True)
+    survival: float = eqx.field(static=True)
     half_view: float | None = eqx.field(static=True)
 
     def init(self, prior: Any) -> Any:
         """The inner tracker's state."""
         return self.inner.init(prior)
 
-    def predict(self, state: Any, control: Step, *, key: Key[Array, ""] | None = None) -> Any:
-        """Every target one step later, with doubts about those that went out of view."""
+    def predict(self, state: Any, control: Control, *, key: Key[Array, ""] | None = None) -> Any:
+        """Targets one step later, with reduced existence of those out of view."""
         state = self.inner.predict(state, control.dt, key=key)
         if self.half_view is None:
             return state
@@ -208,13 +208,13 @@ class WatchedTracker(Tracker):
             means, where = state.mixture.means, lambda s: s.mixture.weights
         else:
             means, where = state.means(), lambda s: s.existence
-        factor = jnp.where(is_in_view(means[:, :3], control.camera, self.half_view), 1.0, self.stay)
+        factor = jnp.where(is_in_view(means[:, :3], control.camera, self.half_view), 1.0, self.survival)
         return eqx.tree_at(where, state, where(state) * factor)
 
     def update(
-        self, state: Any, measurement: Frame, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
+        self, state: Any, measurement: Measurement, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[Any, TrackerInfo]:
-        """The targets given a frame, seen from where its camera is."""
+        """Targets given the detections of an image, with noise by the pose of its camera."""
 
         def cameras(tracker: Any) -> tuple:
             return tracker.model.filter.sensor.camera, tracker.model.birth.sensor.camera
@@ -223,17 +223,15 @@ class WatchedTracker(Tracker):
         return inner.update(state, measurement.values, valid, key=key)
 
     def extract(self, state: Any) -> Targets:
-        """All targets that are not quite unlikely; those of a PHD filter may share a label."""
-        if isinstance(state, PhdState):
-            return replace(self.inner, extraction=LEAST).extract(state)
+        """The inner tracker's targets; components of a PHD filter may share a label."""
         return self.inner.extract(state)
 
 
 def is_in_view(places: Float[Array, "k 3"], camera: Float[Array, "4 4"], half_view: float) -> Bool[Array, " k"]:
-    """Which places in the world a camera sees, sideways.
+    """Which positions lie in a camera's horizontal field of view.
 
     Args:
-        places: in the world.
+        places: positions in the world.
         camera: T_world_camera.
         half_view: tangent of the half angle of view.
 
@@ -241,5 +239,6 @@ def is_in_view(places: Float[Array, "k 3"], camera: Float[Array, "4 4"], half_vi
         >>> is_in_view(jnp.array([[0.0, 0, 9], [9, 0, 9], [0, 0, -9]]), jnp.eye(4), 0.9).tolist()
         [True, False, False]
     """
-    seen = matmul(places - camera[None, :3, 3].astype(places.dtype), camera[:3, :3].astype(places.dtype))
-    return (seen[:, 2] > NEAREST) & (jnp.abs(seen[:, 0]) < half_view * jnp.maximum(seen[:, 2], 0.0))
+    in_camera = matmul(places - camera[None, :3, 3].astype(places.dtype), camera[:3, :3].astype(places.dtype))
+    x, z = in_camera[:, 0], in_camera[:, 2]
+    return (z > MIN_DEPTH) & (jnp.abs(x) < half_view * jnp.maximum(z, 0.0))

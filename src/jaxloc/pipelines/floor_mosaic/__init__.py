@@ -1,19 +1,24 @@
 """Mosaics of floors, and localization in them."""
 
-from jaxloc.pipelines.floor_mosaic import mosaic, path
+from jaxloc.pipelines.floor_mosaic import localization, mosaic, options, registration
+from jaxloc.pipelines.floor_mosaic.localization import tracking_rectifier
 from jaxloc.pipelines.floor_mosaic.mosaic import (
     FloorMosaic,
-    Tracked,
-    localize,
+    Frame,
+    Output,
+    State,
+    finish,
+    init,
     make_mosaic,
     make_view,
-    tracking_rectifier,
+    run,
+    split_frames,
+    step,
 )
-from jaxloc.pipelines.floor_mosaic.path import (
-    Config,
-    OdometryNoise,
+from jaxloc.pipelines.floor_mosaic.options import Config, OdometryNoise
+from jaxloc.pipelines.floor_mosaic.registration import (
     Pair,
-    PathBuilder,
+    Path,
     odometry_covariances,
     planar,
     pose_of_row,
@@ -23,18 +28,26 @@ from jaxloc.pipelines.floor_mosaic.path import (
 __all__ = [
     "Config",
     "FloorMosaic",
+    "Frame",
     "OdometryNoise",
+    "Output",
     "Pair",
-    "PathBuilder",
-    "Tracked",
-    "localize",
+    "Path",
+    "State",
+    "finish",
+    "init",
+    "localization",
     "make_mosaic",
     "make_view",
     "mosaic",
     "odometry_covariances",
-    "path",
+    "options",
     "planar",
     "pose_of_row",
+    "registration",
     "row_of_pose",
+    "run",
+    "split_frames",
+    "step",
     "tracking_rectifier",
 ]

@@ -1,45 +1,47 @@
-"""Lane following: the position of a vehicle in its lane, image by image."""
+"""Lane following: lateral position and heading of a vehicle in its lane, image by image."""
 
-from jaxloc.pipelines.lane_following import following, pitch, tracker
-from jaxloc.pipelines.lane_following.following import Config, Frame, LaneFollower, Step, follow, level
-from jaxloc.pipelines.lane_following.pitch import Pitch, estimate_pitch
-from jaxloc.pipelines.lane_following.tracker import (
+from jaxloc.pipelines.lane_following import following, lane_tracker, pitch
+from jaxloc.pipelines.lane_following.following import Config, Frame, Output, State, correct_pitch, init, run, step
+from jaxloc.pipelines.lane_following.lane_tracker import (
     FitSensor,
-    Moved,
-    Tracker,
-    adapt,
-    begin,
+    LaneTracker,
+    Update,
+    adapt_template,
     border_columns,
-    follow_template,
-    painted_bank,
+    detect_by_template,
+    detect_lane,
+    initial_state,
+    painted_templates,
     predict,
-    recognize,
-    settle,
-    unknown_state,
+    update_by_borders,
+    update_by_template,
 )
+from jaxloc.pipelines.lane_following.pitch import Pitch, estimate_pitch
 
 __all__ = [
     "Config",
     "FitSensor",
     "Frame",
-    "LaneFollower",
-    "Moved",
+    "LaneTracker",
+    "Output",
     "Pitch",
-    "Step",
-    "Tracker",
-    "adapt",
-    "begin",
+    "State",
+    "Update",
+    "adapt_template",
     "border_columns",
+    "correct_pitch",
+    "detect_by_template",
+    "detect_lane",
     "estimate_pitch",
-    "follow",
-    "follow_template",
     "following",
-    "level",
-    "painted_bank",
+    "init",
+    "initial_state",
+    "lane_tracker",
+    "painted_templates",
     "pitch",
     "predict",
-    "recognize",
-    "settle",
-    "tracker",
-    "unknown_state",
+    "run",
+    "step",
+    "update_by_borders",
+    "update_by_template",
 ]

@@ -1,10 +1,12 @@
-"""Lane following: where a vehicle is in its lane, image by image.
+"""Lane following: lateral position and heading of a vehicle in its lane, and the lane's curvature, image by image.
 
-RALPH starts it, and starts it again where it was lost; Dickmanns' filter tracks the borders; where too little paint
-is seen, the look of the road across carries it on.
+RALPH detects the lane, also after it was lost; Dickmanns' Kalman filter tracks the painted borders; where there is too
+little paint, a template of the road's appearance is tracked.
 """
 
+import dataclasses
 import itertools
+import math
 from collections.abc import Iterable, Iterator
 from typing import Any, Protocol, runtime_checkable
 
@@ -20,9 +22,10 @@ from jaxloc.lanes.departure import time_to_line_crossing
 from jaxloc.lanes.dickmanns import LaneMotion, Ride, RoadState, Windows
 from jaxloc.lanes.ground_view import GroundGrid
 from jaxloc.lanes.ralph import Template
-from jaxloc.pipelines.lane_following import tracker
+from jaxloc.pipelines.images import check_image
+from jaxloc.pipelines.lane_following import lane_tracker
+from jaxloc.pipelines.lane_following.lane_tracker import LaneTracker, Update
 from jaxloc.pipelines.lane_following.pitch import Pitch, estimate_pitch
-from jaxloc.pipelines.lane_following.tracker import Moved, Tracker
 from jaxloc.sensors.ground_camera import GroundCamera
 
 
@@ -30,21 +33,21 @@ class Config(eqx.Module):
     """Options of lane following.
 
     Attributes:
-        lane_width: m,
+        lane_width: expected width, m,
         lane_width_sigma: and its standard deviation, m.
-        vehicle_width: for the warning, m.
-        speed: m/s.
+        vehicle_width: for the time to line crossing, m.
+        speed: of the vehicle, m/s.
         interval: between images that have no time, s.
-        sequence: whether images without a time are of one drive; each is looked at for itself otherwise.
+        sequence: whether images without a time are a sequence; otherwise each is processed on its own.
         near: range of the nearest windows, m; 0 for what the image shows.
         far: range of the farthest ones, m; 0 for 20 m and 1.5 s of driving.
-        rows: of the image at which borders are told.
-        blend: share of each image in the template of the road's look.
-        patience: images without a lane after which it is searched for anew.
-        pitch_frames: images from which an unknown pitch is estimated.
-        pitch_sigma: standard deviation of a pitch that was given, rad.
-        motion: of the filter.
-        trust: in an edge.
+        rows: number of image rows for which the columns of the borders are computed.
+        blend: weight of each image in the template of the road's appearance.
+        patience: number of images without a lane after which it is detected anew.
+        pitch_frames: number of images from which an unknown pitch is estimated.
+        pitch_sigma: standard deviation of a given pitch, rad.
+        motion: motion model of the filter.
+        thresholds: acceptance thresholds of an edge.
     """
 
     lane_width: float = 3.6
@@ -61,7 +64,7 @@ class Config(eqx.Module):
     pitch_frames: int = 25
     pitch_sigma: float = 0.006
     motion: LaneMotion = LaneMotion()
-    trust: dickmanns.Trust = dickmanns.Trust()
+    thresholds: dickmanns.EdgeThresholds = dickmanns.EdgeThresholds()
 
     def __check_init__(self):
         for name in ("lane_width", "lane_width_sigma", "vehicle_width", "interval", "pitch_sigma"):
@@ -78,7 +81,7 @@ class Config(eqx.Module):
 
 @runtime_checkable
 class Frame(Protocol):
-    """An image: gray levels, and s since the first one, or None."""
+    """A grayscale image with its time."""
 
     @property
     def gray(self) -> np.ndarray:
@@ -87,23 +90,23 @@ class Frame(Protocol):
 
     @property
     def time(self) -> float | None:
-        """S since the first image."""
+        """Seconds since the first image, or None."""
         ...
 
 
-class Step(eqx.Module):
-    """The lane at one image.
+class Output(eqx.Module):
+    """Lane estimated at one image.
 
     Attributes:
-        index: of the image.
+        index: number of the image, from 0.
         lane: offset (m), heading (rad), curvature (1/m) and its rate (1/m^2).
         width: of the lane, m.
         pitch: of the camera, rad.
         covariance: of offset, heading, curvature, rate, width and pitch.
         confidence: 0 to 1.
-        ok: whether this image shows the lane; it is predicted where not.
-        source: what showed it: "start", "borders", "template", or "prediction".
-        found: windows with an edge, along the left and the right border.
+        ok: whether the lane was measured in this image; otherwise it is predicted.
+        source: what it was measured by: "start" (detection), "borders", "template", or "prediction".
+        found: number of windows with an edge, along the left and the right border.
         rows: of the image.
         left: column of the left border in each of them, px,
         right: and of the right one.
@@ -127,156 +130,127 @@ class Step(eqx.Module):
     crossing_side: int
 
 
-class LaneFollower:
-    """Follows a lane through images that come one at a time.
+class State(eqx.Module):
+    """State of lane following between two images.
+
+    Attributes:
+        config: options.
+        tracker: camera and models.
+        shape: rows and columns of the images.
+        rows: of the image for which the borders are computed.
+        painted: templates of painted borders.
+        saved: template that was given, if any.
+        template: of the road's appearance so far.
+        has_template: whether there is one.
+        belief: state of the filter.
+        missing: number of images in a row without a lane.
+        time: of the last image, s; nan where it had none.
+        index: number of the next image.
+    """
+
+    config: Config
+    tracker: LaneTracker
+    shape: tuple[int, int]
+    rows: Float64[np.ndarray, " r"]
+    painted: Template
+    saved: Template | None
+    template: Template
+    has_template: bool
+    belief: GaussianState
+    missing: int
+    time: float
+    index: int
+
+
+def init(
+    config: Config,
+    ground: GroundCamera,
+    shape: tuple[int, int],
+    *,
+    template: Template | None = None,
+    pitch_sigma: float | None = None,
+) -> State:
+    """The state before the first image.
 
     Args:
+        config: options.
         ground: the camera over the road, with its mean pitch.
         shape: rows and columns of the images.
-        config: options.
-        template: what the road looks like across, where it may have no paint; none by default.
-        pitch_sigma: how well the pitch is known, rad; that of the options by default.
+        template: appearance of the road across the lane, where it may have no paint; none by default.
+        pitch_sigma: standard deviation of the pitch, rad; that of the options by default.
 
     Raises:
         ValueError: the camera does not see the road between the nearest and farthest windows.
     """
-
-    def __init__(
-        self,
-        ground: GroundCamera,
-        shape: tuple[int, int],
-        config: Config = Config(),
-        *,
-        template: Template | None = None,
-        pitch_sigma: float | None = None,
-    ):
-        self.config, self.shape = config, shape
-        near, far, rows = _field(ground, shape, config)
-        width = jnp.asarray(config.lane_width, ground.height.dtype)
-        sigma = config.pitch_sigma if pitch_sigma is None else max(pitch_sigma, config.pitch_sigma)
-        self._tracker = Tracker(
-            ground,
-            GroundGrid.between(near, far, 9.6),
-            Windows(near, far),
-            config.motion,
-            config.trust,
-            width,
-            jnp.asarray(config.lane_width_sigma, width.dtype),
-            jnp.asarray(sigma, width.dtype),
-        )
-        self._rows = rows
-        self._bank = tracker.painted_bank(self._tracker.grid, width)
-        self._saved = template
-        self._template: Template | None = template
-        self._state: GaussianState = tracker.unknown_state(self._tracker)
-        self._missing = config.patience
-        self._time: float | None = None
-        self._index = 0
-
-    def follow(self, frame: Frame, *, yaw_rate: float | None = None) -> Step:
-        """Looks at the next image.
-
-        Args:
-            frame: of the shape that was told.
-            yaw_rate: of the vehicle since the last one, rad/s; None where not known: it is taken to follow the lane.
-
-        Returns:
-            The lane.
-
-        Raises:
-            ValueError: the image has another shape.
-        """
-        if frame.gray.shape != self.shape:
-            raise ValueError(f"The image has the shape {frame.gray.shape}; the follower was told {self.shape}.")
-        image = jnp.asarray(frame.gray, self._tracker.width.dtype)
-        moved, source = self._look(image, self._ride(frame.time, yaw_rate))
-        self._state = moved.state
-        ok = bool(moved.ok)
-        self._missing = 0 if ok else self._missing + 1
-        if ok and source != "template":
-            self._learn(image)
-        step = self._step(moved, source if ok else "prediction")
-        self._index += 1
-        return step
-
-    def _ride(self, time: float | None, yaw_rate: float | None) -> Ride | None:
-        """What happened since the last image; None if the last one is of no use."""
-        alone = time is None and not self.config.sequence
-        before, self._time = self._time, time
-        if self._index == 0 or alone:
-            return None
-        dt = self.config.interval if time is None or before is None else max(time - before, 0.0)
-        known = yaw_rate is not None
-        return Ride(dt, self.config.speed, yaw_rate if known else 0.0, known)
-
-    def _look(self, image: jax.Array, ride: Ride | None) -> tuple[Moved, str]:
-        if ride is None:
-            self._state, self._missing = tracker.unknown_state(self._tracker), self.config.patience
-            self._template = self._saved
-        elif self._missing < self.config.patience:
-            predicted = tracker.predict(self._tracker, self._state, ride)
-            moved = tracker.settle(self._tracker, predicted, image)
-            if bool(moved.ok) or self._template is None:
-                return moved, "borders"
-            return tracker.follow_template(self._tracker, moved.state, image, self._template), "template"
-        found = tracker.begin(self._tracker, image, self._bank)
-        if not bool(found.ok) and self._saved is not None:
-            found = tracker.recognize(self._tracker, image, self._saved)
-        if bool(found.ok):
-            return found, "start"
-        state = self._state if ride is None else tracker.predict(self._tracker, self._state, ride)
-        return eqx.tree_at(lambda m: m.state, found, state), "prediction"
-
-    def _learn(self, image: jax.Array) -> None:
-        mean, rate = self._state.mean, self.config.blend
-        old = self._template
-        if old is None:
-            left = self._bank.left[0]
-            old, rate = Template(jnp.zeros_like(left), jnp.zeros(left.shape, bool), left), 1.0
-        share = jnp.asarray(rate, image.dtype)
-        self._template = tracker.adapt(self._tracker, image, mean, old, share)
-
-    def _step(self, moved: Moved, source: str) -> Step:
-        config, state = self.config, moved.state
-        mean: RoadState = state.mean
-        columns = np.asarray(tracker.border_columns(self._tracker, mean, jnp.asarray(self._rows, jnp.float32)))
-        crossing = time_to_line_crossing(mean.lane, mean.width, config.vehicle_width, config.speed)
-        lane = mean.lane
-        return Step(
-            index=self._index,
-            lane=np.array([float(part) for part in (lane.offset, lane.heading, lane.curvature, lane.rate)]),
-            width=float(mean.width),
-            pitch=float(self._tracker.ground.pitch + mean.pitch),
-            covariance=np.asarray(state.covariance, np.float64),
-            confidence=float(moved.confidence),
-            ok=bool(moved.ok),
-            source=source,
-            found=(int(moved.found[0]), int(moved.found[1])),
-            rows=self._rows,
-            left=columns[0].astype(np.float64),
-            right=columns[1].astype(np.float64),
-            crossing=float(crossing.time),
-            crossing_side=int(crossing.side),
-        )
+    near, far, rows = _field(ground, shape, config)
+    width = jnp.asarray(config.lane_width, ground.height.dtype)
+    sigma = config.pitch_sigma if pitch_sigma is None else max(pitch_sigma, config.pitch_sigma)
+    tracker = LaneTracker(
+        ground,
+        GroundGrid.between(near, far, 9.6),
+        Windows(near, far),
+        config.motion,
+        config.thresholds,
+        width,
+        jnp.asarray(config.lane_width_sigma, width.dtype),
+        jnp.asarray(sigma, width.dtype),
+    )
+    painted = lane_tracker.painted_templates(tracker.grid, width)
+    left = painted.left[0]
+    first = Template(jnp.zeros_like(left), jnp.zeros(left.shape, bool), left) if template is None else template
+    belief = lane_tracker.initial_state(tracker)
+    templates = (painted, template, first, template is not None)
+    return State(config, tracker, shape, rows, *templates, belief, config.patience, math.nan, 0)
 
 
-def follow(
+def step(state: State, frame: Frame, *, yaw_rate: float | None = None) -> tuple[State, Output]:
+    """Estimates the lane at the next image.
+
+    Args:
+        state: from `init` or the last step.
+        frame: grayscale image of the shape given to `init`, and its time.
+        yaw_rate: of the vehicle since the last image, rad/s; None where not known: it is assumed to follow the lane.
+
+    Returns:
+        The next state, and the lane.
+
+    Raises:
+        ValueError: the image is no grayscale image of bytes or floats, or has another shape.
+    """
+    check_image(frame.gray, state.shape)
+    image = jnp.asarray(frame.gray, state.tracker.width.dtype)
+    ride = _ride(state, frame.time, yaw_rate)
+    if ride is None:  # an image on its own, or the first: nothing of the past is used
+        state = _reset(state)
+    update, source = _measure(state, image, ride)
+    ok = bool(update.ok)
+    output = _output(state, update, source if ok else "prediction")
+    template, has_template = state.template, state.has_template
+    if ok and source != "template":
+        template, has_template = _learn(state, image, update.state.mean), True
+    time = math.nan if frame.time is None else float(frame.time)
+    missing = 0 if ok else state.missing + 1
+    changed = {"template": template, "has_template": has_template, "belief": update.state}
+    return dataclasses.replace(state, **changed, missing=missing, time=time, index=state.index + 1), output
+
+
+def run(
     frames: Iterable[Frame],
+    config: Config,
     ground: GroundCamera,
-    config: Config = Config(),
     *,
     pitch_known: bool = True,
     template: Template | None = None,
     yaw_rates: Iterable[float] | None = None,
-) -> Iterator[Step]:
-    """Follows a lane through images.
+) -> Iterator[Output]:
+    """Follows a lane through a recording, see `step`.
 
     Args:
         frames: images of one shape.
-        ground: the camera over the road.
         config: options.
+        ground: the camera over the road.
         pitch_known: False to estimate the pitch from the vanishing point of the first images.
-        template: what the road looks like across, where it may have no paint.
+        template: appearance of the road across the lane, where it may have no paint.
         yaw_rates: of the vehicle before each image, rad/s; None where not known.
 
     Yields:
@@ -284,48 +258,115 @@ def follow(
 
     Example:
         >>> import jaxloc as jl
-        >>> from jaxloc.pipelines.lane_following.following import Config, follow
+        >>> from jaxloc.pipelines import lane_following
         >>> ground = jl.sensors.GroundCamera(jl.sensors.Pinhole(250.0, 250.0, 159.5, 100.0), height=1.3, pitch=0.03)
-        >>> list(follow([], ground, Config()))
+        >>> list(lane_following.run([], lane_following.Config(), ground))
         []
     """
-    frames = iter(frames)
-    sigma = None
+    frames, sigma = iter(frames), None
     if not pitch_known:
         first = list(itertools.islice(frames, config.pitch_frames))
-        pitch, ground = level(first, ground)
+        pitch, ground = correct_pitch(first, ground)
         sigma, frames = pitch.sigma, itertools.chain(first, frames)
     rates: Iterator[Any] = itertools.repeat(None) if yaw_rates is None else iter(yaw_rates)
-    follower: LaneFollower | None = None
+    state: State | None = None
     for frame in frames:
-        if follower is None:
-            shape = (frame.gray.shape[0], frame.gray.shape[1])
-            follower = LaneFollower(ground, shape, config, template=template, pitch_sigma=sigma)
-        yield follower.follow(frame, yaw_rate=next(rates))
+        if state is None:
+            shape = check_image(frame.gray, (0, 0))
+            state = init(config, ground, shape, template=template, pitch_sigma=sigma)
+        state, output = step(state, frame, yaw_rate=next(rates))
+        yield output
 
 
-def level(frames: Iterable[Frame], ground: GroundCamera) -> tuple[Pitch, GroundCamera]:
-    """The pitch that images show, and the camera with it.
+def correct_pitch(frames: Iterable[Frame], ground: GroundCamera) -> tuple[Pitch, GroundCamera]:
+    """The pitch estimated from images, and the camera with it.
 
     Args:
-        frames: of a stretch that is straight on the whole.
+        frames: of a mostly straight road.
         ground: the camera; its pitch stays where no vanishing point is found.
     """
     pitch = estimate_pitch((frame.gray for frame in frames), ground)
     return pitch, eqx.tree_at(lambda g: g.pitch, ground, jnp.asarray(pitch.value, ground.pitch.dtype))
 
 
+def _ride(state: State, time: float | None, yaw_rate: float | None) -> Ride | None:
+    """Time and motion since the last image; None if the last one is of no use."""
+    if state.index == 0 or (time is None and not state.config.sequence):
+        return None
+    dt = state.config.interval if time is None or math.isnan(state.time) else max(time - state.time, 0.0)
+    known = yaw_rate is not None
+    return Ride(dt, state.config.speed, yaw_rate if known else 0.0, known)
+
+
+def _reset(state: State) -> State:
+    """The state before any image, with the template that was given."""
+    has_template = state.saved is not None
+    template = state.template if state.saved is None else state.saved
+    changed = {"template": template, "has_template": has_template, "missing": state.config.patience}
+    return dataclasses.replace(state, belief=lane_tracker.initial_state(state.tracker), **changed)
+
+
+def _measure(state: State, image: jax.Array, ride: Ride | None) -> tuple[Update, str]:
+    """Tracks the lane by borders or template, or detects it where it was lost."""
+    tracker, belief = state.tracker, state.belief
+    predicted = belief if ride is None else lane_tracker.predict(tracker, belief, ride)
+    if state.missing < state.config.patience:
+        update = lane_tracker.update_by_borders(tracker, predicted, image)
+        if bool(update.ok) or not state.has_template:
+            return update, "borders"
+        return lane_tracker.update_by_template(tracker, update.state, image, state.template), "template"
+    found = lane_tracker.detect_lane(tracker, image, state.painted)
+    if not bool(found.ok) and state.saved is not None:
+        found = lane_tracker.detect_by_template(tracker, image, state.saved)
+    if bool(found.ok):
+        return found, "start"
+    return eqx.tree_at(lambda u: u.state, found, predicted), "prediction"
+
+
+def _learn(state: State, image: jax.Array, mean: RoadState) -> Template:
+    """The template blended with the image; the first one is the image's."""
+    old, rate = state.template, state.config.blend
+    if not state.has_template:
+        left = state.painted.left[0]
+        old, rate = Template(jnp.zeros_like(left), jnp.zeros(left.shape, bool), left), 1.0
+    return lane_tracker.adapt_template(state.tracker, image, mean, old, jnp.asarray(rate, image.dtype))
+
+
+def _output(state: State, update: Update, source: str) -> Output:
+    config, belief, rows = state.config, update.state, state.rows
+    mean: RoadState = belief.mean
+    columns = np.asarray(lane_tracker.border_columns(state.tracker, mean, jnp.asarray(rows, jnp.float32)))
+    crossing = time_to_line_crossing(mean.lane, mean.width, config.vehicle_width, config.speed)
+    lane = mean.lane
+    return Output(
+        index=state.index,
+        lane=np.array([float(part) for part in (lane.offset, lane.heading, lane.curvature, lane.rate)]),
+        width=float(mean.width),
+        pitch=float(state.tracker.ground.pitch + mean.pitch),
+        covariance=np.asarray(belief.covariance, np.float64),
+        confidence=float(update.confidence),
+        ok=bool(update.ok),
+        source=source,
+        found=(int(update.found[0]), int(update.found[1])),
+        rows=rows,
+        left=columns[0].astype(np.float64),
+        right=columns[1].astype(np.float64),
+        crossing=float(crossing.time),
+        crossing_side=int(crossing.side),
+    )
+
+
 def _field(
     ground: GroundCamera, shape: tuple[int, int], config: Config
 ) -> tuple[float, float, Float64[np.ndarray, " r"]]:
-    """Ranges of the nearest and farthest windows, and rows at which borders are told."""
+    """Ranges of the nearest and farthest windows, and rows for which the borders are computed."""
     middle, bottom = ground.camera.cx, jnp.asarray(shape[0] - 1.0, ground.camera.cx.dtype)
-    seen, _ = ground.to_ground_components(middle, bottom)
-    near = max(1.02 * float(seen), 5.0) if config.near <= 0.0 else config.near
+    nearest, _ = ground.to_ground_components(middle, bottom)
+    near = max(1.02 * float(nearest), 5.0) if config.near <= 0.0 else config.near
     far = 20.0 + 1.5 * config.speed if config.far <= 0.0 else config.far
     if not (bool(ground.meets_ground_components(middle, bottom)) and 0.0 < near < 0.8 * far):
         raise ValueError(
-            f"The camera sees the road from {float(seen):.1f} m on, with the pitch {float(ground.pitch):.3f} rad; "
+            f"The camera sees the road from {float(nearest):.1f} m on, with the pitch {float(ground.pitch):.3f} rad; "
             f"it is needed from {near:.1f} m to {far:.1f} m: check its pitch and height."
         )
     _, top = ground.project_components(jnp.asarray(far), jnp.zeros(()))

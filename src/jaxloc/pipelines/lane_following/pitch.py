@@ -1,4 +1,4 @@
-"""The pitch of a camera over a road, from the point where straight borders meet in its images."""
+"""Pitch of a camera over a road, from the vanishing point of straight lines along it."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -12,19 +12,19 @@ from jaxloc.features.opencv.backend import load, to_uint8
 from jaxloc.sensors.ground_camera import GroundCamera
 
 _MOST_LINES = 240
-_NEAR = 0.008  # a line passes the point at no more than this, in focal lengths
-_STEEPEST, _FLATTEST = 1.35, 0.25  # angles of borders against the horizon, rad: poles and shadows are left out
-_SHORTEST = 0.12  # of lines in all on each side, in focal lengths
+_NEAR = 0.008  # standard deviation of the distance of a line from the vanishing point, in focal lengths
+_STEEPEST, _FLATTEST = 1.35, 0.25  # angles of lines against the horizon, rad: poles and shadows are ignored
+_SHORTEST = 0.12  # least total length of the lines on each side, in focal lengths
 
 
 class Pitch(eqx.Module):
-    """A pitch, and how surely it is known.
+    """An estimated pitch with its standard deviation.
 
     Attributes:
         value: rad, positive looks down.
         sigma: standard deviation, rad.
-        support: part of the length of all lines that pass the vanishing point.
-        ok: whether lines of both sides agree; the pitch of the camera as it was given otherwise.
+        support: fraction of the length of all lines that passes through the vanishing point.
+        ok: whether lines of both sides agree; otherwise the value is the given pitch of the camera.
     """
 
     value: float
@@ -34,15 +34,15 @@ class Pitch(eqx.Module):
 
 
 def estimate_pitch(images: Iterable[np.ndarray], ground: GroundCamera, *, most: float = 0.3) -> Pitch:
-    """Finds the pitch of a camera by the vanishing point of straight lines along the road.
+    """Estimates the pitch of a camera by the vanishing point of straight lines along the road.
 
     Straight edges in the lower part of all images vote for the point that most of them pass, on both sides of it; a
     direction ``(a, b, 1)`` in the camera that the road's lines share is level when ``tan(pitch) = elevation``.
 
     Args:
-        images: gray levels, of a stretch that is straight on the whole.
+        images: gray levels, of a mostly straight road.
         ground: the camera; its pitch is not used.
-        most: greatest pitch to believe, rad.
+        most: greatest plausible pitch, rad.
 
     Returns:
         The pitch.
@@ -84,7 +84,7 @@ def estimate_pitch(images: Iterable[np.ndarray], ground: GroundCamera, *, most: 
 
 
 def _road_lines(image: np.ndarray, level: GroundCamera) -> Float64[np.ndarray, "n 4"]:
-    """Straight edges: ends (left, up) of each in a camera without lens, roll and pitch, in focal lengths."""
+    """Straight edges: end points (left, up) in a pinhole camera without roll and pitch, in focal lengths."""
     cv2 = load()
     gray = to_uint8(image)
     rows, columns = gray.shape
@@ -114,7 +114,7 @@ def _slope(lines: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, " n"]:
 def _vote(
     lines: Float64[np.ndarray, "n 4"], length: Float64[np.ndarray, " n"], left: Any, right: Any, most: float
 ) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, " n"]]:
-    """The crossing of a line of each side that most of the others pass, refined; and what each line gave to it."""
+    """The intersection of a left and a right line with the most votes, refined; and the weight of each line in it."""
     a = np.repeat(left, len(right))
     b = np.tile(right, len(left))
     slope, start = _slope(lines), lines[:, :2]
@@ -127,7 +127,7 @@ def _vote(
     points = points[:: max(1, len(points) // 4000)]
     far = (height - points[:, 1:] + slope * points[:, :1]) / np.hypot(1.0, slope)
     votes = np.exp(-0.5 * (far / _NEAR) ** 2) * length
-    # A fan of lines on one side alone tells nothing: the weaker side counts.
+    # Lines of one side alone do not determine the point: the weaker side counts.
     point = points[np.argmax(np.minimum(votes[:, left].sum(axis=1), votes[:, right].sum(axis=1)))]
     for _ in range(10):
         weight = length * np.exp(-0.5 * (_distances(lines, point) / _NEAR) ** 2)

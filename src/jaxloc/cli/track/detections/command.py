@@ -1,33 +1,33 @@
-"""``jaxloc track --detections``: read what a detector found, track it, write tables, metrics and report."""
+"""``jaxloc track --detections``: tracking by detection, from the outputs of any detector."""
 
 import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import numpy as np
-import typer
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
-from jaxloc.cli import configuration, results, session
+from jaxloc.cli import lifecycle
+from jaxloc.cli.lifecycle import Arguments
 from jaxloc.cli.track.detections import report
 from jaxloc.data import DataError
 from jaxloc.data.io.text import read_text
 from jaxloc.data.io.writing import RowWriter
-from jaxloc.data.tracking import Detections, LabelledTracks, kitti_tracking, mot
+from jaxloc.data.tracking import Detections, LabeledTracks, kitti_tracking, mot, tracks_csv
 
-HEADER = "frame,id,x,y,z,vx,vy,vz,var_x,var_y,var_z,u,v"
 TRACKERS = ("gmphd", "jpda", "gnn")
 FORMATS = ("auto", "kitti", "mot")
-_KITTI_WORDS, _MOT_WORDS = 15, range(7, 11)
+_KITTI_COLUMNS, _MOT_COLUMNS = 15, range(7, 11)
 
 
 class Inputs(eqx.Module):
-    """What the command was given.
+    """Arguments of the command.
 
     Attributes:
         detections: file of a detector.
-        form: of the files, one of `FORMATS`.
+        form: format of the files, one of `FORMATS`.
         poses: file of camera poses, 12 numbers a line (KITTI only).
         calibration: file of the cameras (KITTI only).
         truth: file of true tracks, in the format of the detections.
@@ -42,13 +42,22 @@ class Inputs(eqx.Module):
     tracker: str = "gmphd"
 
 
-def run_detections(inputs: Inputs, out: Path, config_path: Path | None) -> int:
-    """Tracks ready detections.
+def default_config(form: str = "kitti", tracker: str = "gmphd") -> Any:
+    """The default options for a format and a tracker."""
+    from jaxloc.pipelines import detection_tracking
+
+    strategy = detection_tracking.STRATEGIES[tracker]()
+    if form == "mot":
+        return detection_tracking.Config.for_boxes(strategy)
+    return detection_tracking.Config(strategy)
+
+
+def run_detections(inputs: Inputs, arguments: Arguments) -> int:
+    """Tracks objects by their detections.
 
     Args:
         inputs: files.
-        out: folder for the results.
-        config_path: YAML file with options.
+        arguments: output folder and options.
 
     Returns:
         The exit code.
@@ -56,45 +65,47 @@ def run_detections(inputs: Inputs, out: Path, config_path: Path | None) -> int:
     Raises:
         DataError: when any input is bad; nothing is written then.
     """
-    results.prepare(out)
-    form = _form(inputs)
+    lifecycle.prepare(arguments.out)
+    form = _find_format(inputs)
     found, truth, poses = _read_kitti(inputs) if form == "kitti" else _read_mot(inputs)
     if not found.valid.any():
         raise DataError(inputs.detections, "holds no detection that can be used")
     projection = None
     if inputs.calibration is not None:
         projection = kitti_tracking.read_calibration(inputs.calibration).projections[2]
-    config = _config(inputs, form, config_path)
+    config = arguments.read(default_config(form, inputs.tracker))
+    record = report.Record(f"Tracks: {inputs.detections.name}", found, truth=truth, cameras=poses)
+
+    def write(pair: tuple[float, Any], rows: Mapping[str, RowWriter]) -> None:
+        record.add(*pair)
+        for slot in range(len(record.outputs[-1])):
+            rows["tracks.csv"].append(_row(record, len(record.outputs) - 1, slot, projection))
+
+    files = {"tracks.csv": tracks_csv.HEADER}
     plain = {name: None if value is None else str(value) for name, value in vars(inputs).items()}
-    with session.output_folder(out):
-        record = _run(found, truth, poses, config, title=f"Tracks: {inputs.detections.name}")
-        with RowWriter(out / "tracks.csv", HEADER) as rows:
-            for frame in range(len(found)):
-                for slot in np.flatnonzero(record.tracked.valid[frame]).tolist():
-                    rows.append(_row(record, frame, slot, projection))
-        mot.write_mot(out / "tracks_mot.txt", record.tracks())
-        metrics = results.write(record, config, out, {"command": "track", **plain, "form": form})
-    _announce(metrics, out)
-    return 0
+    with lifecycle.open_run(arguments.out) as run:
+        run.stream(_outputs(found, poses, config), write, title="tracking", total=len(found), files=files)
+        mot.write_mot(arguments.out / "tracks_mot.txt", record.labeled_tracks())
+        return run.finish(record, config, {"command": "track", **plain, "form": form}, _summary)
 
 
-def _form(inputs: Inputs) -> str:
-    """The format of the detections: that which is named, or as many numbers a line as it has."""
+def _find_format(inputs: Inputs) -> str:
+    """The format of the detections: that which is named, or by the number of columns."""
     form = inputs.form
     if form == "auto":
         lines = read_text(inputs.detections).splitlines()
-        words = next((line.replace(",", " ").split() for line in lines if line.strip()), [])
-        form = "kitti" if len(words) == _KITTI_WORDS else "mot" if len(words) in _MOT_WORDS else ""
+        columns = len(next((line.replace(",", " ").split() for line in lines if line.strip()), []))
+        form = "kitti" if columns == _KITTI_COLUMNS else "mot" if columns in _MOT_COLUMNS else ""
     if not form:
-        raise DataError(inputs.detections, "is in no format that is known; name one by --format kitti or mot")
+        raise DataError(inputs.detections, "has an unknown format; name one by --format kitti or mot")
     if form == "mot":
         for name, path in (("--poses", inputs.poses), ("--calib", inputs.calibration)):
             if path is not None:
-                raise DataError(name, "is of no use to boxes in images (format mot)")
+                raise DataError(name, "does not apply to boxes in images (format mot)")
     return form
 
 
-def _read_kitti(inputs: Inputs) -> tuple[Detections, LabelledTracks | None, np.ndarray | None]:
+def _read_kitti(inputs: Inputs) -> tuple[Detections, LabeledTracks | None, np.ndarray | None]:
     poses = None if inputs.poses is None else kitti_tracking.read_camera_poses(inputs.poses)
     count = None if poses is None else len(poses)
     found = kitti_tracking.read_detections(inputs.detections, num_frames=count, poses=poses)
@@ -110,7 +121,7 @@ def _read_kitti(inputs: Inputs) -> tuple[Detections, LabelledTracks | None, np.n
     return found, truth, poses
 
 
-def _read_mot(inputs: Inputs) -> tuple[Detections, LabelledTracks | None, None]:
+def _read_mot(inputs: Inputs) -> tuple[Detections, LabeledTracks | None, None]:
     found = mot.read_mot_detections(inputs.detections)
     if inputs.truth is None:
         return found, None, None
@@ -120,77 +131,43 @@ def _read_mot(inputs: Inputs) -> tuple[Detections, LabelledTracks | None, None]:
     return found, mot.read_mot_tracks(inputs.truth, num_frames=count), None
 
 
-def _config(inputs: Inputs, form: str, path: Path | None) -> Any:
-    from jaxloc.pipelines import detection_tracking as pipeline
-
-    strategy = pipeline.STRATEGIES[inputs.tracker]()
-    default = pipeline.Config(strategy) if form == "kitti" else pipeline.Config.for_boxes(strategy)
-    return default if path is None else configuration.read_config(path, default)
-
-
-def _run(
-    found: Detections, truth: LabelledTracks | None, poses: np.ndarray | None, config: Any, title: str
-) -> report.Record:
-    """The pipeline, twice: the second pass shows how quick it is once it is compiled."""
-    from jaxloc.pipelines import detection_tracking as pipeline
+def _outputs(found: Detections, poses: np.ndarray | None, config: Any) -> Iterator[tuple[float, Any]]:
+    """The tracks of each frame, with the seconds since the last one."""
+    from jaxloc.pipelines import detection_tracking
 
     places = found.positions
     if places is None:
         sides = found.boxes[..., 2:] - found.boxes[..., :2]
         places = np.concatenate([report.centers(found.boxes), sides], axis=2)
-    seconds = []
-    for _ in range(2):
+    frames = detection_tracking.split_frames(places, found.scores, found.valid, found.times, cameras=poses)
+    start = time.perf_counter()
+    for output in detection_tracking.run(frames, config):
+        yield time.perf_counter() - start, output
         start = time.perf_counter()
-        tracked = pipeline.track(places, found.scores, found.valid, found.times, cameras=poses, config=config)
-        seconds.append(time.perf_counter() - start)
-    boxes, boxed = _boxes(found, tracked)
-    first, second = seconds
-    return report.Record(title, found, tracked, boxes, boxed, truth=truth, cameras=poses, seconds=(first, second))
-
-
-def _boxes(found: Detections, tracked: Any) -> tuple[Float64[np.ndarray, "t k 4"], Bool[np.ndarray, "t k"]]:
-    """Boxes of tracks, and which have one: of a solid that of its detection, or of its last one."""
-    if found.positions is None:
-        center, sides = tracked.places[..., :2], np.maximum(tracked.places[..., 2:], 1.0)
-        boxes = np.concatenate([center - 0.5 * sides, center + 0.5 * sides], axis=2)
-        return np.where(tracked.valid[..., None], boxes, 0.0), tracked.valid
-    boxes = np.zeros((*tracked.valid.shape, 4))
-    boxed = np.zeros(tracked.valid.shape, bool)
-    last: dict[int, np.ndarray] = {}
-    for frame, slot in np.argwhere(tracked.valid):
-        identity, detection = int(tracked.ids[frame, slot]), tracked.slots[frame, slot]
-        if detection >= 0:
-            last[identity] = found.boxes[frame, detection]
-        if identity in last:
-            boxes[frame, slot], boxed[frame, slot] = last[identity], True
-    return boxes, boxed
 
 
 def _row(record: report.Record, frame: int, slot: int, projection: np.ndarray | None) -> str:
-    """A row of the table: in the world, or of the center of a box in px, without z."""
-    tracked = record.tracked
-    size = 3 if record.solid else 2
-    place, velocity = tracked.places[frame, slot], tracked.velocities[frame, slot]
-    variances = np.diagonal(tracked.covariances[frame, slot])
-    words = []
-    for values in (place, velocity, variances):
-        words += [f"{value:.6g}" for value in values[:size]] + [""] * (3 - size)
-    words += [f"{value:.6g}" for value in _pixel(record, frame, slot, projection)] or ["", ""]
-    return ",".join([str(record.found.frames[frame]), str(tracked.ids[frame, slot]), *words])
+    """A row of the table: in the world, or of the center of a box in px."""
+    output, size = record.outputs[frame], 3 if record.in_world else 2
+    variances = np.diagonal(output.covariances[slot])[:size]
+    uv = _pixel(record, frame, slot, projection)
+    number, identity = int(record.found.frames[frame]), int(output.ids[slot])
+    return tracks_csv.format_track(
+        number, identity, output.places[slot, :size], output.velocities[slot, :size], variances, uv
+    )
 
 
-def _pixel(record: report.Record, frame: int, slot: int, projection: np.ndarray | None) -> list[float]:
-    """Where a track is in the image: its place, where the camera is known, else the center of its box."""
+def _pixel(record: report.Record, frame: int, slot: int, projection: Float64[np.ndarray, "3 4"] | None) -> list[float]:
+    """A track's position in the image where the camera is known, else the center of its box."""
     if projection is None:
-        boxed = record.boxed[frame, slot]
-        return report.centers(record.boxes[frame : frame + 1])[0, slot].tolist() if boxed else []
+        box = record.boxes[frame][slot]
+        return [] if box is None else report.centers(box[None])[0].tolist()
     pose = np.eye(4) if record.cameras is None else record.cameras[frame]
-    x, y, depth = projection @ [*(pose[:3, :3].T @ (record.tracked.places[frame, slot] - pose[:3, 3])), 1.0]
+    position = pose[:3, :3].T @ (record.outputs[frame].places[slot] - pose[:3, 3])
+    x, y, depth = projection @ [*position, 1.0]
     return [x / depth, y / depth] if depth > 0 else []
 
 
-def _announce(metrics: dict[str, Any], out: Path) -> None:
-    words = [f"{metrics['frames']} frames", f"{metrics['tracks']} tracks"]
-    if metrics.get("hota") is not None:
-        words.append(f"HOTA {metrics['hota']:.3f}")
-    typer.echo(f"{', '.join(words)}: {out / 'report.html'}")
+def _summary(metrics: dict[str, Any]) -> str:
+    text = f"{metrics['frames']} frames, {metrics['tracks']} tracks"
+    return text if metrics.get("hota") is None else f"{text}, HOTA {metrics['hota']:.3f}"
