@@ -111,11 +111,11 @@ def exact(a, readings, noise=0.25):
     mean = variance = total = 0.0
     for reading in readings:
         mean, variance = a * mean, a * a * variance + 1.0
-        innovation_variance = variance + noise
-        total -= 0.5 * ((reading - mean) ** 2 / innovation_variance + np.log(2 * np.pi * innovation_variance))
+        total_variance = variance + noise
+        total -= 0.5 * ((reading - mean) ** 2 / total_variance + np.log(2 * np.pi * total_variance))
         mean, variance = (
-            mean + variance / innovation_variance * (reading - mean),
-            variance * noise / innovation_variance,
+            mean + variance / total_variance * (reading - mean),
+            variance * noise / total_variance,
         )
     return total
 

@@ -67,7 +67,7 @@ def test_jit_grad_and_vmap(x64, rng):
 
 
 def test_wrong_size_says_what_is_needed():
-    with pytest.raises(ValueError, match="7 entries.*6 directions"):
+    with pytest.raises(ValueError, match="7 entries.*6 degrees"):
         retract(SE3.identity(), jnp.zeros(7))
     with pytest.raises(ValueError, match="no tangent"):
         local({"n": 3}, {"n": 3})

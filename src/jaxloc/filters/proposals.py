@@ -102,7 +102,7 @@ class Proposal(eqx.Module):
         observation: "Observation",
         resample: Callable[[Particles], Resampled],
     ) -> Weighted:
-        """Particles weighed by the observation, perhaps moved by it."""
+        """Particles weighted by the observation, possibly moved by it."""
 
 
 class Observation(eqx.Module):
@@ -219,7 +219,7 @@ class Auxiliary(Proposal):
         observation: Observation,
         resample: Callable[[Particles], Resampled],
     ) -> Weighted:
-        """Particles chosen by the first-stage weights, drawn again, and weighed by what those missed."""
+        """Particles resampled by first-stage weights, sampled again, with second-stage weights."""
         particles = _without_score(particles, noise, observation)
         conditioned = _conditioned(noise, observation) if self.guided else None
         ahead = observation.log_likelihood(noise.centers) if conditioned is None else conditioned.log_likelihood

@@ -83,7 +83,7 @@ class RangeBearingSensor(Sensor):
 
 
 def observe(sensor: SE2, landmark: Float[Array, "2"], index: Int[Array, ""]) -> RangeBearing:
-    """The reading of a landmark from a sensor's pose T_world_sensor; finite and differentiable even at the landmark.
+    """Range and bearing of a landmark from T_world_sensor; finite and differentiable even at the landmark.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -198,12 +198,12 @@ def sanitize(reading: RangeBearing, valid: Bool[Array, ""]) -> tuple[RangeBearin
 
 
 def pose_of(state: Any) -> SE2:
-    """The pose of a state that is one, or has one as its field ``pose``."""
+    """The pose of a state that is a pose, or has a field ``pose``."""
     return state if isinstance(state, SE2) else state.pose
 
 
 def row(table: Float[Array, "k 2"], index: Int[Array, ""]) -> Float[Array, "2"]:
-    """A row of a map, the nearest one for a number outside of it."""
+    """A row of a map; indices out of range are clipped."""
     return jnp.take(table, index, axis=0, mode="clip")
 
 

@@ -26,13 +26,13 @@ class Candidates(eqx.Module):
 
 
 class Consensus(eqx.Module):
-    """The model that most of the data agree with.
+    """Result of RANSAC: the model with the lowest MSAC cost.
 
     Attributes:
         model: the model; that of an arbitrary sample where not ok.
         inliers: items within the threshold of it.
         score: MSAC cost, ``sum min(r^2 / t^2, 1)`` over valid items: 0 is perfect.
-        ok: whether any sample gave a model that more items agree with than make a sample.
+        ok: whether any model has more inliers than a sample has items.
     """
 
     model: Any
@@ -42,7 +42,7 @@ class Consensus(eqx.Module):
 
 
 class RobustEstimate(eqx.Module):
-    """An estimate from data with outliers, and the inliers it rests on.
+    """An estimate from data with outliers, and its inliers.
 
     The fields of `Estimate` can be read from the record itself (stacked ones from a stacked record).
 
@@ -98,10 +98,10 @@ class RobustEstimate(eqx.Module):
         return self.estimate.describe()
 
     def check(self) -> "RobustEstimate":
-        """Itself, when it is ok (host only).
+        """The estimate itself, if ok (host only).
 
         Raises:
-            ValueError: it is not; the message says why.
+            ValueError: if not; the message gives the status.
         """
         self.estimate.check()
         return self
@@ -121,9 +121,9 @@ def ransac(
 ) -> Consensus:
     """Random sample consensus with the MSAC score; every hypothesis is fitted and scored in one batch.
 
-    The classical loop ends when a model is good enough; a batch of fixed size has no such end, and needs none (see
-    `required_hypotheses`). Re-estimating from the inliers, the last of the five steps, is the caller's: a weighted or
-    robust `solve` from this model, which is also what gives derivatives and a covariance.
+    The number of hypotheses is fixed (see `required_hypotheses`), without early termination. Refining the model on its
+    inliers is left to the caller: a weighted or robust `solve` from this model, which also gives derivatives and a
+    covariance.
 
     Args:
         data: pytree whose arrays have a leading axis over n items.

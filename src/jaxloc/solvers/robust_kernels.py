@@ -1,8 +1,8 @@
-"""Robust kernels: how much a residual counts once it is too large to be noise.
+"""Robust kernels (M-estimators): Huber, Cauchy, Geman-McClure, Tukey and Barron.
 
 A kernel is a pair of functions of the squared whitened residual ``s = r^2``: the cost ``rho(s)`` and the weight
-``rho'(r) / r`` that iteratively reweighted least squares puts on it. Scales are in sigmas, since residuals are
-whitened.
+``rho'(r) / r`` of iteratively reweighted least squares (IRLS). Scales are in standard deviations, since residuals
+are whitened.
 
 References:
     Barron, "A general and adaptive robust loss function", CVPR 2019; Black and Rangarajan, IJCV 1996.
@@ -21,7 +21,7 @@ Squared = Float[Array, "*shape"]
 
 
 class Loss(eqx.Module):
-    """A robust kernel."""
+    """Interface of robust kernels."""
 
     @abstractmethod
     def rho(self, squared: Squared) -> Squared:
@@ -37,7 +37,7 @@ class Loss(eqx.Module):
 
 
 class Quadratic(Loss):
-    """Plain least squares."""
+    """Quadratic kernel: plain least squares."""
 
     def rho(self, squared: Squared) -> Squared:
         """Half the square."""

@@ -1,4 +1,4 @@
-"""A table of tracks with room for a fixed number, and their logic: tentative, confirmed, gone."""
+"""Track management: a fixed-size table of tracks, with their initiation, confirmation and deletion."""
 
 from abc import abstractmethod
 from typing import Any
