@@ -206,7 +206,10 @@ def lane(
         Path,
         typer.Option("--camera", metavar="CAMERA.yaml", help="OpenCV's camera file, plus height_m (pitch_rad)."),
     ],
-    speed: Annotated[float, typer.Option("--speed", metavar="M/S", min=0.0, help="Of the vehicle.")] = 20.0,
+    speed: Annotated[
+        float | None,
+        typer.Option("--speed", metavar="M/S", min=0.0, help="Of the vehicle; else by the options."),
+    ] = None,
     out: _Out = Path("out"),
     config: _Config = None,
     settings: _Set = None,

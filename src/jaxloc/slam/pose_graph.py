@@ -54,7 +54,7 @@ class PoseGraph(Problem):
     """``sum_e rho(|r_e|^2)`` with ``r_e = S_e^(-1/2) log(Z_e^-1 T_i^-1 T_j)``; the state is all poses but the first.
 
     Attributes:
-        first: the first pose, held fixed.
+        fixed: the first pose, held fixed.
         first: of each edge.
         second: of each edge.
         measured: of each edge.
@@ -63,7 +63,7 @@ class PoseGraph(Problem):
         loss: robust kernel, on an edge's squared distance in sigmas.
     """
 
-    first: Any
+    fixed: Any
     first: Int[Array, " m"]
     second: Int[Array, " m"]
     measured: Any
@@ -89,7 +89,7 @@ class PoseGraph(Problem):
 
     def _errors(self, state: Any) -> tuple[Any, Any, Float[Array, "m d"]]:
         """Poses at both ends of each edge, and what the measurement misses."""
-        poses = jax.tree.map(lambda head, rest: jnp.concatenate([head[None], rest]), self.first, state)
+        poses = jax.tree.map(lambda head, rest: jnp.concatenate([head[None], rest]), self.fixed, state)
         near, far = _at(poses, self.first), _at(poses, self.second)
         missed = jax.vmap(lambda z, a, b: (z.inverse() @ (a.inverse() @ b)).log())(self.measured, near, far)
         return near, far, jnp.where(self.valid[:, None], missed, 0.0)
@@ -103,7 +103,7 @@ class PoseGraph(Problem):
         """In closed form: ``dr = S^(-1/2) Jr(r)^-1 (d_j - Ad(T_j^-1 T_i) d_i)``."""
         near, far, missed = self._errors(state)
         dof, count = missed.shape[1], state.batch_shape[0]
-        group = type(self.first)
+        group = type(self.fixed)
         by_second = matmul(self.whitener, jax.vmap(lambda r: group.left_jacobian_inverse(-r))(missed))
         by_second = jnp.where(self.valid[:, None, None], by_second, 0.0)
         by_first = -matmul(by_second, jax.vmap(lambda a, b: (b.inverse() @ a).adjoint())(near, far))
@@ -168,7 +168,7 @@ def optimize(
         )
     problem = PoseGraph.of(edges, poses, loss)
     fit = solve(problem, _at(poses, slice(1, None)), solver=solver, max_steps=max_steps)
-    value = jax.tree.map(lambda head, rest: jnp.concatenate([head[None], rest]), problem.first, fit.value)
+    value = jax.tree.map(lambda head, rest: jnp.concatenate([head[None], rest]), problem.fixed, fit.value)
     pad = ((poses.dof, 0), (poses.dof, 0))
     covariance, information = jnp.pad(fit.covariance, pad), jnp.pad(fit.information, pad)
     return Estimate(value, covariance, fit.cost, fit.ok, fit.num_steps, fit.status, information)

@@ -53,7 +53,18 @@ def read(path):
 
 def test_a_video(trip, inputs, tmp_path, capsys):
     out = tmp_path / "out"
-    arguments = ["lane", inputs / "road.avi", "--camera", inputs / "camera.yaml", "--speed", "20", "--out", out]
+    arguments = [
+        "lane",
+        inputs / "road.avi",
+        "--camera",
+        inputs / "camera.yaml",
+        "--speed",
+        "21",
+        "--set",
+        "speed=5",
+        "--out",
+        out,
+    ]
     assert run([str(argument) for argument in arguments]) == 0
     assert sorted(path.name for path in out.iterdir()) == sorted([*FILES, "annotated.mp4"])
     assert str(out / "report.html") in capsys.readouterr().out
@@ -78,7 +89,7 @@ def test_a_video(trip, inputs, tmp_path, capsys):
         assert f"<h2>{title}</h2>" in page
     assert "http://" not in page
     config = yaml.safe_load((out / "config.yaml").read_text())
-    assert config["command"] == "lane" and config["config"]["speed"] == 20.0
+    assert config["command"] == "lane" and config["config"]["speed"] == 21.0
 
 
 def test_images_and_an_unknown_pitch(inputs, tmp_path):

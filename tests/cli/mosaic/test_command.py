@@ -64,15 +64,15 @@ def test_every_file_is_written(drive, inputs, tmp_path, capsys):
     assert np.hypot(errors[:, 0], errors[:, 1]).max() < 2e-4
 
     place = yaml.safe_load((out / "mosaic.yaml").read_text())
-    picture = cv2.imread(str(out / place["image"]), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(str(out / place["image"]), cv2.IMREAD_GRAYSCALE)
     # The place under the first camera: from the lower left corner, rows counted from the top.
     x, y = (drive.poses[1, :2] - np.array(place["origin"][:2])) / place["resolution"]
-    u, v = round(x - 0.5), round(picture.shape[0] - y - 0.5)
+    u, v = round(x - 0.5), round(image.shape[0] - y - 0.5)
     texture, low = drive.floor.texture, np.array(drive.floor.origin)
     column, row = np.rint((drive.poses[1, :2] - low) / drive.floor.resolution).astype(int)
-    seen = picture[v - 20 : v + 21, u - 20 : u + 21].astype(float)[::-1]
+    patch = image[v - 20 : v + 21, u - 20 : u + 21].astype(float)[::-1]
     truth = texture[row - 20 : row + 21, column - 20 : column + 21]
-    assert np.corrcoef(seen.ravel(), truth.ravel())[0, 1] > 0.9
+    assert np.corrcoef(patch.ravel(), truth.ravel())[0, 1] > 0.9
 
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["left_out"] == ["floor003.png"] and metrics["images_used"] == 5 and metrics["graph_solved"]

@@ -64,7 +64,7 @@ def test_positions_in_the_world(write):
     assert found.headings[1, 0] - found.headings[0, 0] == pytest.approx(np.pi / 2)
 
 
-def test_detections_keep_the_surest_and_count_the_others(write):
+def test_detections_keep_the_highest_scores_and_count_the_others(write):
     path = write(detection(1, 0.2), detection(1, 0.9), detection(1, "nan"), detection(1, 0.5), detection(3, x="inf"))
     found = read_detections(path, num_frames=6, capacity=2)
     assert found.valid.sum(axis=1).tolist() == [0, 2, 0, 0, 0, 0]

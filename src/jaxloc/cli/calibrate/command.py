@@ -69,7 +69,9 @@ def run_images(images: list[Path], right: list[Path] | None, board: tuple[str, f
     inputs = {"command": "calibrate", "images": [str(path) for path in images], "grid": board[0], "square": square}
     inputs["right"] = None if right is None else [str(path) for path in right]
     searches = [search(paths, grid, title) for paths, title in zip(lists, ("boards", "right boards"), strict=False)]
-    with lifecycle.open_run(arguments.out) as run:
+    import jax
+
+    with jax.enable_x64(True), lifecycle.open_run(arguments.out) as run:
         with session.show_progress("calibration", 1) as progress:
             record = _calibrate(searches, board_points(grid, square), config)
             progress(1)

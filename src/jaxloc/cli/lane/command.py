@@ -25,13 +25,13 @@ def default_config() -> Any:
     return lane_following.Config()
 
 
-def run_recording(path: Path, camera_path: Path, speed: float, arguments: Arguments) -> int:
+def run_recording(path: Path, camera_path: Path, speed: float | None, arguments: Arguments) -> int:
     """Follows the lane in a recording.
 
     Args:
         path: image, folder of images, or video.
         camera_path: YAML file of the camera.
-        speed: of the vehicle, m/s.
+        speed: of the vehicle, m/s; None for that of the options.
         arguments: output folder and options.
 
     Returns:
@@ -45,10 +45,9 @@ def run_recording(path: Path, camera_path: Path, speed: float, arguments: Argume
     ground = GroundCamera(file.camera, file.require_height(), file.pitch or 0.0, file.roll or 0.0)
     recording = open_recording(path)
     _check_shape(file, recording)
+    config = arguments.read(default_config())
     try:
-        config = dataclasses.replace(arguments.read(default_config()), speed=speed)
-    except DataError:
-        raise
+        config = config if speed is None else dataclasses.replace(config, speed=speed)
     except ValueError as error:
         raise DataError("--speed", str(error)) from None
     state, pitch = _begin(recording, ground, config, file)

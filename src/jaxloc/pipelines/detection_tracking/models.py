@@ -4,6 +4,7 @@ A measurement is one vector: (x, y, z, score) of an object in the world, or (cen
 of a box in an image. The state of a target is these values and their rates.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -223,7 +224,9 @@ class MovingCameraTracker(Tracker):
         return inner.update(state, measurement.values, valid, key=key)
 
     def extract(self, state: Any) -> Targets:
-        """The inner tracker's targets; components of a PHD filter may share a label."""
+        """Targets with an existence of at least `MIN_EXISTENCE`; components of a PHD filter may share a label."""
+        if isinstance(state, PhdState):  # its own threshold also decides which labels are kept apart
+            return replace(self.inner, extraction=MIN_EXISTENCE).extract(state)
         return self.inner.extract(state)
 
 

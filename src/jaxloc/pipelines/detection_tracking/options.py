@@ -40,8 +40,7 @@ class Phd(Strategy):
     def tracker(self, model: TargetModel, capacity: int) -> Tracker:
         """A `GmPhd`."""
         close = MahalanobisDistance(self.merge)
-        options = {"prune": self.prune, "closeness": close, "gate": self.gate}
-        return GmPhd(model, capacity, **options, extraction=MIN_EXISTENCE)
+        return GmPhd(model, capacity, prune=self.prune, closeness=close, gate=self.gate)
 
 
 class ExistenceStrategy(Strategy):

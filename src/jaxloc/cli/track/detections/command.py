@@ -161,7 +161,7 @@ def _pixel(record: report.Record, frame: int, slot: int, projection: Float64[np.
     """A track's position in the image where the camera is known, else the center of its box."""
     if projection is None:
         box = record.boxes[frame][slot]
-        return [] if box is None else report.centers(box[None])[0].tolist()
+        return [] if box is None else report.centers(box).tolist()
     pose = np.eye(4) if record.cameras is None else record.cameras[frame]
     position = pose[:3, :3].T @ (record.outputs[frame].places[slot] - pose[:3, 3])
     x, y, depth = projection @ [*position, 1.0]

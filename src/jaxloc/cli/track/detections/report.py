@@ -183,7 +183,7 @@ class Record:
         return report.Section("Number of targets", "Reported tracks in each frame.", figure)
 
 
-def centers(boxes: Float64[np.ndarray, "t k 4"]) -> Float64[np.ndarray, "t k 2"]:
+def centers(boxes: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray, "*n 2"]:
     """Centers of boxes (left, top, right, bottom)."""
     return 0.5 * (boxes[..., :2] + boxes[..., 2:])
 
