@@ -96,7 +96,7 @@ def test_gradient_of_intensity_is_that_of_finite_differences(parts):
     ("weights", "covariance", "match"),
     [
         ([0.5, -0.1], [[1.0, 0.0], [0.0, 1.0]], "never negative; got -0.1"),
-        ([0.5, np.nan], [[1.0, 0.0], [0.0, 1.0]], "not finite"),
+        ([0.5, np.nan], [[1.0, 0.0], [0.0, 1.0]], "non-finite"),
         ([0.5, 0.1], [[1.0, 2.0], [2.0, 1.0]], "Covariance 1 .*negative eigenvalue -1"),
     ],
 )

@@ -153,7 +153,7 @@ def test_stacks_are_refused_and_integers_kept():
         {"count": jnp.array([3, 4, 5]), "pose": jax.vmap(SO2)(jnp.ones(3), jnp.zeros(3))}, jnp.array([0.0, 1.0, 0.0])
     )
     assert int(cloud.mean()["count"]) == 4
-    with pytest.raises(ValueError, match="one pose a particle"):
+    with pytest.raises(ValueError, match="one pose per particle"):
         Particles(jax.vmap(jax.vmap(SO2))(jnp.ones((3, 2)), jnp.zeros((3, 2)))).mean()
 
 
