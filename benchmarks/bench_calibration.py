@@ -14,7 +14,7 @@ from jaxloc.features.opencv.chessboard import board_points, find_chessboard
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration import (
     Corners,
-    Glass,
+    BrownConradyModel,
     Intrinsics,
     board_errors,
     calibrate,
@@ -123,7 +123,7 @@ def _simulated(trials: int) -> Iterator[Metric]:
     truth = jnp.concatenate([jnp.atleast_1d(leaf) for leaf in jax.tree.leaves(camera)])[free]
 
     def trial(noise: jax.Array) -> tuple[jax.Array, jax.Array]:
-        model = Intrinsics(Glass(radial=2))
+        model = Intrinsics(BrownConradyModel(radial=2))
         fit = calibrate(board, corners + noise, intrinsics=model, shape=(480, 640), sigma=_SIGMA)
         found = camera_parameters(fit)
         error = found.values[free] - truth

@@ -27,7 +27,7 @@ from jaxloc.refinement.pallet import (
     level_view,
     printed_jacobian,
 )
-from jaxloc.refinement.pallet.edges import band_profile, hole_band, strongest, summed
+from jaxloc.refinement.pallet.edges import band_profile, hole_band, strongest_edges, summed
 
 FAST = "JAXLOC_FAST" in os.environ
 plt.rcParams["figure.dpi"] = 70
@@ -55,7 +55,7 @@ plt.show()
 view = level_view(picture, camera)
 band = hole_band(view, kinds[0], jnp.array(2.0))
 profile = band_profile(summed(view.slope), band[0], band[1])
-dark, light = strongest(-profile, 4), strongest(profile, 4)
+dark, light = strongest_edges(-profile, 4), strongest_edges(profile, 4)
 plt.figure(figsize=(8, 3))
 plt.plot(profile, lw=0.8, color="k")
 for peaks, sign, name in ((dark, -1, "darkening"), (light, 1, "lightening")):

@@ -78,7 +78,9 @@ def test_equals_opencv(rng, binary):
     got = match(first, second)
     ties = hamming_distances(first.values, second.values) if binary else None
     for i, ok in enumerate(got.valid.tolist()):
-        assert ok == (i in want) or (ties is not None and (ties[i] == ties[i].min()).sum() > 1)
+        # OpenCV and we may choose differently among equal distances, and only there.
+        if ties is None or (ties[i] == ties[i].min()).sum() == 1:
+            assert ok == (i in want)
         if ok and i in want:
             np.testing.assert_allclose(got.distance[i], want[i].distance, rtol=1e-5)
             assert ties is not None or int(got.index[i]) == want[i].trainIdx

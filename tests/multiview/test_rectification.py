@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxloc.images.interpolation import sample
-from jaxloc.multiview.rectification import lookup, rectify, rectifying_homographies
+from jaxloc.multiview.rectification import rectification_map, rectify, rectifying_homographies
 from jaxloc.poses import SE3, SO3
 from jaxloc.sensors import BrownConrady, Pinhole
 
@@ -38,7 +38,7 @@ def test_rotations_and_maps_are_those_of_opencv(x64):
     new = np.asarray(found.rig.camera.matrix())
     for camera, turn, (k, d) in ((left, found.R_rectified_left, (k1, d1)), (right, found.R_rectified_right, (k2, d2))):
         expected = cv2.initUndistortRectifyMap(k, d, np.asarray(turn.matrix()), new, size, cv2.CV_32FC1)
-        maps = np.asarray(lookup(camera, turn, found.rig.camera, shape=SHAPE))
+        maps = np.asarray(rectification_map(camera, turn, found.rig.camera, shape=SHAPE))
         known = (maps >= 0).all(axis=-1)
         assert known.mean() > 0.9
         np.testing.assert_allclose(maps[known], np.stack(expected, axis=-1)[known], atol=1e-4)
@@ -65,7 +65,7 @@ def test_maps_read_pictures_like_opencv(dtype, rng):
     left, right, pose = jax.tree.map(lambda leaf: leaf.astype(dtype), pair())
     found = rectify(left, right, pose, shape=SHAPE)
     assert found.rig.camera.fx.dtype == dtype
-    maps = lookup(left, found.R_rectified_left, found.rig.camera, shape=SHAPE)
+    maps = rectification_map(left, found.R_rectified_left, found.rig.camera, shape=SHAPE)
     assert maps.dtype == dtype and maps.shape == (*SHAPE, 2)
     image = cv2.GaussianBlur(rng.uniform(0, 255, SHAPE).astype(np.float32), (0, 0), 2.0)
     ours = sample(jnp.asarray(image, dtype), maps.reshape(-1, 2))
@@ -83,7 +83,7 @@ def test_aligned_cameras_stay(dtype):
     found = rectify(camera, camera, pose, shape=SHAPE)
     np.testing.assert_allclose(found.R_rectified_left.matrix(), np.eye(3), atol=1e-7)
     np.testing.assert_allclose(found.rig.camera.matrix(), camera.matrix(), atol=1e-4)
-    identity = lookup(camera, SO3.identity(dtype), camera, shape=SHAPE)
+    identity = rectification_map(camera, SO3.identity(dtype), camera, shape=SHAPE)
     np.testing.assert_allclose(identity, np.stack(np.meshgrid(range(64), range(48)), axis=-1), atol=1e-4)
 
 
@@ -93,7 +93,7 @@ def test_pairs_that_are_none(translation):
     found = rectify(left, right, SE3(pose.rotation, jnp.array(translation)), shape=SHAPE)
     assert not bool(found.ok)
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(found))
-    assert bool(jnp.isfinite(lookup(left, found.R_rectified_left, found.rig.camera, shape=SHAPE)).all())
+    assert bool(jnp.isfinite(rectification_map(left, found.R_rectified_left, found.rig.camera, shape=SHAPE)).all())
 
 
 def test_gradient(x64):
@@ -101,7 +101,7 @@ def test_gradient(x64):
 
     def row(twist):
         found = rectify(left, right, pose.retract(twist), shape=SHAPE)
-        return lookup(left, found.R_rectified_left, found.rig.camera, shape=SHAPE)[20, 30, 1]
+        return rectification_map(left, found.R_rectified_left, found.rig.camera, shape=SHAPE)[20, 30, 1]
 
     step = 1e-6
     numeric = [(row(step * e) - row(-step * e)) / (2 * step) for e in jnp.eye(6)]

@@ -1,3 +1,5 @@
+"""PnP against OpenCV, PoseLib and SciPy; derivatives, masks and degenerate sets."""
+
 import cv2
 import equinox as eqx
 import jax
@@ -9,12 +11,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxloc.poses import SE3
-from jaxloc.refinement import refine_motion, refine_pose
-from jaxloc.sensors import BrownConrady, Pinhole, StereoRig
-from jaxloc.solvers import Cauchy, Dogleg, GemanMcClure, LevenbergMarquardt, Quadratic, Status
+from jaxloc.refinement import refine_pose
+from jaxloc.sensors import BrownConrady, Pinhole
+from jaxloc.solvers import Cauchy, Dogleg, LevenbergMarquardt, Quadratic, Status
 
 INTRINSICS = (500.0, 490.0, 320.0, 240.0)
-GLASS = (-0.25, 0.08, 1e-3, -5e-4, 0.0)
+LENS = (-0.25, 0.08, 1e-3, -5e-4, 0.0)
 TRUTH = np.array([0.3, -0.2, 0.5, 0.1, -0.15, 0.2])
 COUNT = 16
 
@@ -47,7 +49,7 @@ def from_opencv(rvec, tvec):
     return np.linalg.inv(np.block([[cv2.Rodrigues(rvec)[0], tvec.reshape(3, 1)], [np.zeros((1, 3)), np.ones((1, 1))]]))
 
 
-@pytest.mark.parametrize("lens", [None, GLASS], ids=["no lens", "glass"])
+@pytest.mark.parametrize("lens", [None, LENS], ids=["no lens", "Brown-Conrady"])
 def test_refined_pose_equals_opencv(lens, x64, rng):  # K-56, K-73
     camera, points, pixels = view(rng, lens=lens)
     found = refine_pose(camera, points, pixels, start())
@@ -107,7 +109,7 @@ def summary(camera, points, pixels):
 
 
 def test_gradients_by_pixels_points_and_intrinsics(x64, rng):
-    arguments = view(rng, lens=GLASS)
+    arguments = view(rng, lens=LENS)
     gradient = eqx.filter_jit(jax.grad(lambda a: summary(*a)))(arguments)
     steps = [("pixels", 1e-4), ("points", 1e-6), ("camera", 1e-5)]
     for (_, step), index in zip(steps, (2, 1, 0), strict=True):
@@ -197,104 +199,6 @@ def test_two_points_are_too_few(rng):
     camera, points, pixels = view(rng, np.float32)
     found = refine_pose(camera, points, pixels, start(np.float32), valid=jnp.arange(COUNT) < 2)
     assert not bool(found.ok) and int(found.status) in (Status.RANK_DEFICIENT, Status.MAX_STEPS, Status.INADMISSIBLE)
-
-
-def rig_at(dtype):
-    return StereoRig(Pinhole(*(jnp.asarray(x, dtype) for x in (718.0, 718.0, 607.0, 185.0))), 0.54)
-
-
-MOTION = np.array([0.02, -0.01, 1.0, 0.003, 0.02, -0.002])
-
-
-def drives(rng, seeds, count=60, noise=0.5):
-    """Points of a street from 5 to 60 m, seen before and after a motion of 1 m."""
-    z = rng.uniform(5.0, 60.0, (seeds, count, 1))
-    u, v = rng.uniform(50.0, 1150.0, (seeds, count, 1)), rng.uniform(20.0, 350.0, (seeds, count, 1))
-    points = np.concatenate([(u - 607.0) / 718.0 * z, (v - 185.0) / 718.0 * z, z], axis=2)
-    matrix = np.asarray(SE3.exp(jnp.asarray(MOTION, jnp.float32)).matrix(), float)
-    after = (points - matrix[:3, 3]) @ matrix[:3, :3]
-    rig = rig_at(np.float32)
-    measured = [jax.vmap(rig.project)(jnp.asarray(p, jnp.float32)) for p in (points, after)]
-    return [m + jnp.asarray(noise * rng.normal(size=m.shape), jnp.float32) for m in measured]
-
-
-@eqx.filter_jit
-def motions(previous, current, noise):
-    truth = SE3.exp(jnp.asarray(MOTION, jnp.float32))
-    covariance = noise**2 * jnp.eye(3, dtype=previous.dtype)
-
-    def lane(a, b):
-        rig, guess = rig_at(np.float32), SE3.identity(jnp.float32)
-        found = refine_motion(rig, a, b, guess, covariance_previous=covariance, covariance_current=covariance)
-        left = refine_pose(rig.camera, rig.triangulate(a), b[:, jnp.array([0, 2])], guess)
-        errors = truth.local(found.value), truth.local(left.value)
-        return found.gaussian().mahalanobis_squared(truth), found.ok, errors
-
-    return jax.vmap(lane)(previous, current)
-
-
-def test_motion_is_consistent_and_better_than_one_camera(rng):  # K-86, K-87, T-72
-    nees, ok, (errors, plain) = motions(*drives(rng, 400), jnp.asarray(0.5, jnp.float32))
-    assert np.all(ok)
-    assert 5.4 <= np.mean(nees) <= 6.6
-    rms, rms_plain = (np.sqrt(np.mean(np.sum(np.asarray(e)[:, :3] ** 2, axis=1))) for e in (errors, plain))
-    assert rms < 0.8 * rms_plain
-
-
-def test_motion_without_noise_is_exact(dtype, rng):
-    previous, current = (x[0].astype(dtype) for x in drives(rng, 1, noise=0.0))
-    found = refine_motion(rig_at(dtype), previous, current, SE3.identity(dtype))
-    assert bool(found.ok) and found.covariance.dtype == dtype
-    np.testing.assert_allclose(found.value.log(), MOTION, atol=1e-3)
-
-
-def test_motion_masked_equals_absent(x64, rng):
-    previous, current = (x[0].astype(np.float64) for x in drives(rng, 1))
-    spoiled = current.at[50:].set(jnp.nan)
-    rig, guess = rig_at(np.float64), SE3.identity()
-    masked = refine_motion(rig, previous, spoiled, guess, valid=jnp.arange(60) < 50)
-    absent = refine_motion(rig, previous[:50], current[:50], guess)
-    np.testing.assert_allclose(masked.value.matrix(), absent.value.matrix(), atol=1e-10)
-    np.testing.assert_allclose(masked.covariance, absent.covariance, rtol=1e-7, atol=1e-14)
-    one_each = jnp.tile(jnp.eye(3)[None], (60, 1, 1))
-    each = refine_motion(rig, previous, current, guess, covariance_previous=one_each, covariance_current=one_each)
-    alike = refine_motion(rig, previous, current, guess)
-    np.testing.assert_allclose(each.value.matrix(), alike.value.matrix(), atol=1e-12)
-
-
-def test_motion_with_outliers_under_a_robust_kernel(rng):
-    previous, current = (x[0] for x in drives(rng, 1))
-    current = current.at[:12].add(jnp.asarray(rng.uniform(-40.0, 40.0, (12, 3)), jnp.float32))
-    found = refine_motion(
-        rig_at(np.float32), previous, current, SE3.exp(jnp.asarray(MOTION + 0.01, jnp.float32)), loss=GemanMcClure(3.0)
-    )
-    assert bool(found.ok)
-    np.testing.assert_allclose(found.value.log(), MOTION, atol=0.08)
-
-
-def test_degenerate_motions_are_flagged_and_finite(rng):
-    previous, current = (x[0] for x in drives(rng, 1))
-    everything = jnp.ones(60, bool)
-    cases = [
-        (previous, current, jnp.arange(60) < 2),
-        (previous, current, ~everything),
-        (previous.at[:, 0].set(previous[:, 1] - 1.0), current, everything),
-        (jnp.full_like(previous, jnp.nan), current, everything),
-        (jnp.tile(previous[:1], (60, 1)), jnp.tile(current[:1], (60, 1)), everything),
-        (previous, current, everything),
-    ]
-    batch = [jnp.stack(x) for x in zip(*cases, strict=True)]
-
-    def lane(previous, current, valid):
-        guess = SE3.identity(jnp.float32)
-        found = refine_motion(rig_at(np.float32), previous, current, guess, valid=valid)
-        return jnp.sum(found.value.matrix()) + 1e-12 * jnp.sum(found.covariance), found.ok
-
-    run = jax.jit(jax.vmap(jax.value_and_grad(lane, argnums=(0, 1), has_aux=True)))
-    (values, ok), gradients = run(*batch)
-    assert ok.tolist() == [False] * 5 + [True] and np.all(np.isfinite(values))
-    for gradient in gradients:
-        assert np.all(np.isfinite(gradient)) and not np.any(gradient[:5])
 
 
 def test_new_numbers_compile_nothing(rng):

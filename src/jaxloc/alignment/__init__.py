@@ -1,4 +1,4 @@
-"""Image alignment and point tracking from gray levels."""
+"""Direct image alignment and point tracking: Lucas-Kanade, KLT, ECC, correlation, mutual information."""
 
 from jaxloc.alignment import (
     correlation,

@@ -1,4 +1,4 @@
-"""Alignment by the enhanced correlation coefficient: Lucas-Kanade that seeks the greatest correlation."""
+"""Image alignment by the enhanced correlation coefficient (ECC)."""
 
 from dataclasses import replace
 from typing import Any
@@ -21,16 +21,16 @@ def align(
     weights: Num[Array, "p q"] | Bool[Array, "p q"] | None = None,
     sigma: Any = None,
 ) -> Estimate:
-    """Finds the warp under which image and template correlate most: ECC.
+    """Finds the warp of the greatest correlation of image and template (ECC).
 
     Maximizes ``rho(W) = <i(W), t> / |i(W)| |t|`` of the zero-mean images. Unlike OpenCV's `findTransformECC` it does
-    not throw, tells how sure the result is, and can be differentiated and batched.
+    not throw, has a covariance, and can be differentiated and batched.
 
     Args:
-        image: gray levels, nan where there is no image.
-        template: gray levels, nan where it does not count.
-        warp: its class.
-        initial: where to start, a warp from template pixels to image pixels; the identity by default.
+        image: gray levels, nan where unknown.
+        template: gray levels, nan where unknown.
+        warp: class of the warp.
+        initial: a warp from template pixels to image pixels; the identity by default.
         method: as in `lucas_kanade.align`; its brightness is replaced by `Correlation`.
         weights: of the template's pixels, or a mask.
         sigma: standard deviation of the image's noise, gray levels.
@@ -47,8 +47,8 @@ def align(
         >>> u, v = jnp.meshgrid(jnp.arange(60.0), jnp.arange(50.0))
         >>> scene = lambda u, v: 100 + 40 * jnp.sin(0.3 * u) * jnp.cos(0.25 * v)
         >>> image, template = 0.5 * scene(u, v) + 30, scene(u + 12.3, v + 9.6)[:32, :32]
-        >>> start = jl.images.Translation(jnp.array([11.0, 11.0]))
-        >>> fit = jl.alignment.ecc.align(image, template, jl.images.Translation, start)
+        >>> initial = jl.images.Translation(jnp.array([11.0, 11.0]))
+        >>> fit = jl.alignment.ecc.align(image, template, jl.images.Translation, initial)
         >>> bool(fit.ok), [round(x, 1) for x in fit.value.translation.tolist()]
         (True, [12.3, 9.6])
     """

@@ -1,7 +1,7 @@
-"""Shift, rotation and scale of whole images from their spectra: no start is needed, others may start from here.
+"""Phase correlation: translation, rotation and scale between whole images, without an initial value.
 
-A shift turns the phases of a spectrum and leaves its amplitude as it is [R-33]; rotation and scale of an image rotate
-and scale the amplitude, and become shifts in logarithmic polar coordinates [R-34].
+A translation changes the phases of a spectrum and not its amplitude [R-33]; rotation and scale of an image rotate
+and scale the amplitude, and become translations in log-polar coordinates [R-34].
 """
 
 from typing import Any
@@ -20,19 +20,19 @@ from jaxloc.images.spectrum import LogPolar, amplitude, hann
 from jaxloc.images.warps import Similarity, Translation
 from jaxloc.solvers import Estimate, Status
 
-_LEAST_HEIGHT = 6.0  # of a trusted peak, in standard deviations of the surface of unrelated images
+_LEAST_HEIGHT = 6.0  # of a valid peak, in standard deviations of the surface of unrelated images
 _NEWTON_STEPS = 4
 
 
 class _Peak(eqx.Module):
-    """The best shift of two spectra.
+    """Peak of the phase correlation of two images.
 
     Attributes:
         uv: current from previous, px.
         covariance: px^2.
         information: its inverse.
         height: of the peak, 1 for equal images.
-        ok: True if it stands out.
+        ok: True if it is significant and distinct.
     """
 
     uv: Float[Array, "2"]
@@ -46,11 +46,11 @@ class _Peak(eqx.Module):
 def translation(
     previous: Num[Array, "h w"] | Any, current: Num[Array, "h w"] | Any, *, bandwidth: float = 0.25
 ) -> Estimate:
-    """Finds how far an image has moved: ``current(x + t) ~ previous(x)``, by phase correlation.
+    """Translation between two images by phase correlation: ``current(x + t) ~ previous(x)``.
 
     With the cross-spectrum ``R = conj(F_previous) F_current`` of the images under Hann windows,
     ``c(t) = sum_f w(f) R(f) / |R(f)| exp(2 pi i f.t)`` has a sharp peak. w is a Gaussian low-pass. The highest pixel is
-    refined by Newton steps on this trigonometric sum itself; the last one carries the derivatives of the solution.
+    refined by Newton steps on this trigonometric sum itself; the last one has the derivatives of the solution.
 
     Args:
         previous: gray levels.
@@ -59,8 +59,8 @@ def translation(
 
     Returns:
         Estimate of a `Translation` from previous to current pixels, at most half an image. `cost` is one minus the
-        peak's height; the covariance follows from how far phases scatter about their plane. `ok` is False where nothing
-        stands out: flat or unrelated images.
+        peak's height; the covariance follows from the scatter of phases about their plane. `ok` is False where no peak
+        is significant: flat or unrelated images.
 
     Raises:
         ValueError: shapes differ.
@@ -90,7 +90,7 @@ def similarity(
     bandwidth: float = 0.25,
     rounds: int = 2,
 ) -> Estimate:
-    """Finds rotation, scale and shift between two images: ``image(W(x)) ~ template(x)`` (Fourier-Mellin).
+    """Rotation, scale and translation between two images: ``image(W(x)) ~ template(x)`` (Fourier-Mellin).
 
     The amplitudes of both spectra, high-pass filtered and in logarithmic polar coordinates, are phase-correlated:
     their shift is rotation, up to half a turn, and the logarithm of scale. Both half turns are undone and the images
@@ -107,7 +107,7 @@ def similarity(
     Returns:
         Estimate of a `Similarity` from template to image pixels, for scales between about 0.6 and 1.6. `cost` is one
         minus the height of the last peak; the covariance, of ``W @ exp(d)``, takes rotation and scale, found apart from
-        the shift, as independent of it. `ok` is False where nothing stands out.
+        the shift, as independent of it. `ok` is False where no peak is significant.
 
     Raises:
         ValueError: shapes differ, or there is no round.
@@ -130,14 +130,16 @@ def similarity(
     warp, ok = Similarity.identity(image.dtype), jnp.asarray(True)
     polar_template = sampling.sample(amplitude(_windowed(template)))
     for number in range(rounds):
-        turned, turn = _turn(image, warp, polar_template, sampling)
-        starts = [
-            warp @ _about_center(d, image.shape) for d in (turned, turned + jnp.array([jnp.pi, 0.0], image.dtype))
+        rotation, turn = _rotation_scale(image, warp, polar_template, sampling)
+        candidates = [
+            warp @ _about_center(d, image.shape) for d in (rotation, rotation + jnp.array([jnp.pi, 0.0], image.dtype))
         ]
-        # The second round only polishes.
-        starts = starts if number == 0 else starts[:1]
-        peaks = [_shift(image, template, start, bandwidth) for start in starts]
-        warps = [start @ Similarity.of(Translation(peak.uv)) for start, peak in zip(starts, peaks, strict=True)]
+        # The second round only refines.
+        candidates = candidates if number == 0 else candidates[:1]
+        peaks = [_shift(image, template, candidate, bandwidth) for candidate in candidates]
+        warps = [
+            candidate @ Similarity.of(Translation(peak.uv)) for candidate, peak in zip(candidates, peaks, strict=True)
+        ]
         best = jnp.argmax(jnp.stack([peak.height for peak in peaks]))
         warp, peak = _choose(best, warps), _choose(best, peaks)
         ok = ok & turn.ok & peak.ok
@@ -150,7 +152,7 @@ def _choose(index: Array, records: list) -> Any:
 
 
 def _same_shape(a: Any, b: Any) -> tuple[Array, Array, Bool[Array, ""]]:
-    """Finite floats of one dtype, and whether both have finite pixels."""
+    """Finite floats of one dtype, and whether both images have finite pixels."""
     a = as_gray(a)
     b = as_gray(b, a.dtype)
     if a.shape != b.shape:
@@ -219,17 +221,17 @@ def _correlate(a: Float[Array, "h w"], b: Float[Array, "h w"], bandwidth: float)
     uv = lax.fori_loop(0, _NEWTON_STEPS, advance, whole)
     height, gradient, hessian = _moments(factors, uv)
     step, curved = _newton(gradient, lax.stop_gradient(hessian))
-    # The surface closes upon itself: with the best pixel in the middle, no peak is cut in two.
+    # The surface is periodic: with the best pixel in the middle, no peak is cut at the border.
     around = jnp.roll(surface, (shape // 2)[::-1] - jnp.stack([best // a.shape[1], best % a.shape[1]]), (0, 1))
-    rival = find_peaks(around, count=2, separation=3).scores[1]
+    second = find_peaks(around, count=2, separation=3).scores[1]
     noise = jnp.sqrt(jnp.sum(weight**2))
-    ok = curved & (height > _LEAST_HEIGHT * noise) & (rival < 0.8 * height) & jnp.all(jnp.abs(uv - whole) < 1.0)
+    ok = curved & (height > _LEAST_HEIGHT * noise) & (second < 0.8 * height) & jnp.all(jnp.abs(uv - whole) < 1.0)
     covariance, information = _scatter(frozen, uv, hessian, ok)
     return _Peak(uv + jnp.where(ok, step, 0.0), covariance, information, height, ok)
 
 
 def _newton(gradient: Float[Array, "2"], hessian: Float[Array, "2 2"]) -> tuple[Array, Array]:
-    """Newton's step to a maximum, and whether there is one."""
+    """Newton step to a maximum, and whether the Hessian is negative definite."""
     determinant = hessian[0, 0] * hessian[1, 1] - hessian[0, 1] ** 2
     curved = (hessian[0, 0] < 0) & (determinant > 1e-3 * hessian[0, 0] * hessian[1, 1]) & (determinant > 0)
     inverse = jnp.linalg.inv(jnp.where(curved, hessian, -jnp.eye(2, dtype=hessian.dtype)))
@@ -239,7 +241,7 @@ def _newton(gradient: Float[Array, "2"], hessian: Float[Array, "2 2"]) -> tuple[
 def _scatter(factors: Array, uv: Array, hessian: Array, ok: Array) -> tuple[Array, Array]:
     """Covariance ``H^-1 M H^-1`` with M the sum of squares of each frequency's part of the gradient, and its inverse.
 
-    Twice, as frequencies come in pairs of one phase, and times what the Hann windows make neighbors share.
+    Doubled, as frequencies come in pairs of one phase, and multiplied by the correlation due to the Hann windows.
     """
     u, v = _frequencies(factors.shape[1:], factors.dtype)
     angle = 2 * jnp.pi * (uv[0] * u[None, :] + uv[1] * v[:, None])
@@ -256,11 +258,11 @@ def _scatter(factors: Array, uv: Array, hessian: Array, ok: Array) -> tuple[Arra
     return covariance, jnp.where(ok, jnp.linalg.inv(covariance), 0.0 * eye)
 
 
-def _about_center(turned: Float[Array, "2"], shape: tuple[int, int]) -> Similarity:
+def _about_center(rotation_scale: Float[Array, "2"], shape: tuple[int, int]) -> Similarity:
     """A rotation and a change of scale (its logarithm) about the image's center."""
-    center = _center(shape, turned.dtype)
-    zero = jnp.zeros((), turned.dtype)
-    inner = Similarity.exp(jnp.stack([zero, zero, turned[0], turned[1]]))
+    center = _center(shape, rotation_scale.dtype)
+    zero = jnp.zeros((), rotation_scale.dtype)
+    inner = Similarity.exp(jnp.stack([zero, zero, rotation_scale[0], rotation_scale[1]]))
     return Similarity.of(Translation(center) @ inner @ Translation(-center))
 
 
@@ -268,32 +270,32 @@ def _center(shape: tuple[int, int], dtype: Any) -> Float[Array, "2"]:
     return 0.5 * jnp.array([shape[1] - 1, shape[0] - 1], dtype=dtype)
 
 
-def _seen(image: Float[Array, "h w"], warp: Similarity) -> Float[Array, "h w"]:
-    """The image under a warp: windowed, and blank where it ends."""
+def _warped(image: Float[Array, "h w"], warp: Similarity) -> Float[Array, "h w"]:
+    """The warped image: windowed, and blank outside."""
     v, u = jnp.meshgrid(*(jnp.arange(side, dtype=image.dtype) for side in image.shape), indexing="ij")
     right, down = warp.map_components(u.reshape(-1), v.reshape(-1))
     read = sample(image - jnp.mean(image), jnp.stack([right, down], axis=1), method=Bicubic())
     return _windowed(read.values.reshape(image.shape))
 
 
-def _turn(image: Array, warp: Similarity, polar_template: Array, sampling: LogPolar) -> tuple[Array, _Peak]:
-    """What is left of rotation and log-scale between the image under a warp and the template."""
-    polar = sampling.sample(amplitude(_seen(image, warp)))
+def _rotation_scale(image: Array, warp: Similarity, polar_template: Array, sampling: LogPolar) -> tuple[Array, _Peak]:
+    """Remaining rotation and log-scale between the warped image and the template."""
+    polar = sampling.sample(amplitude(_warped(image, warp)))
     peak = _correlate(sampling.tapered(polar_template), sampling.tapered(polar), 0.15)
-    # An image that is larger by s has a spectrum smaller by s.
+    # Scaling an image by s scales its spectrum by 1/s.
     return sampling.turn(peak.uv), peak
 
 
 def _shift(image: Array, template: Array, warp: Similarity, bandwidth: float) -> _Peak:
-    return _correlate(_windowed(template), _seen(image, warp), bandwidth)
+    return _correlate(_windowed(template), _warped(image, warp), bandwidth)
 
 
 def _joint(turn: _Peak, shift: _Peak, sampling: LogPolar, shape: tuple[int, int]) -> tuple[Array, Array]:
     """Covariance and information of the warp's tangent at the template's origin."""
     zero = jnp.zeros((2, 2), shift.covariance.dtype)
     scale = sampling.steps(shift.covariance.dtype)
-    turned = turn.covariance[::-1, ::-1] * scale[:, None] * scale[None, :]
-    centered = jnp.block([[shift.covariance, zero], [zero, turned]])
+    rotated = turn.covariance[::-1, ::-1] * scale[:, None] * scale[None, :]
+    centered = jnp.block([[shift.covariance, zero], [zero, rotated]])
     adjoint = Similarity.of(Translation(_center(shape, zero.dtype))).adjoint()
     covariance = matmul(adjoint, matmul(centered, adjoint.T))
     return covariance, jnp.linalg.inv(covariance)

@@ -1,4 +1,4 @@
-"""The pose of a camera straight from pixels: its image laid upon a map image of a plane."""
+"""Direct pose estimation: a camera's image aligned with a map image of a textured plane."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from jaxloc.solvers.cholesky import factor
 
 
 class Appearance(eqx.Module):
-    """What is solved for: a pose, and how gray levels of the image follow from those of the map.
+    """Unknowns of the alignment: a pose, gain and bias.
 
     Attributes:
         pose: ``T_world_camera``.
@@ -31,14 +31,14 @@ class Appearance(eqx.Module):
 
 
 class PlaneAppearance(Problem):
-    """Differences between an image and the map points that it shows, over their standard deviation.
+    """Least-squares problem of gray-level differences between an image and visible map points.
 
     Attributes:
         camera: of the image at this scale.
         image: gray levels.
         points: of the map, world frame, "3 n".
         values: of the map there, zero mean and unit variance.
-        spread: standard deviation of the map's gray levels.
+        contrast: standard deviation of the map's gray levels.
         mean: of the map's gray levels.
         sigma: standard deviation of a difference, gray levels.
         loss: robust kernel.
@@ -48,13 +48,13 @@ class PlaneAppearance(Problem):
     image: Float[Array, "h w"]
     points: Float[Array, "3 n"]
     values: Float[Array, " n"]
-    spread: Float[Array, ""]
+    contrast: Float[Array, ""]
     mean: Float[Array, ""]
     sigma: Float[Array, ""]
     loss: Any = Quadratic()
 
-    def look(self, pose: SE3) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-        """The image at the map's points, and where there is one."""
+    def sample(self, pose: SE3) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+        """The image at the map's points, and where it is known."""
         rotation = pose.rotation.matrix()
         x, y, z = matmul(rotation.T, self.points - pose.translation[:, None])
         front = self.camera.in_front_components(x, y, z)
@@ -64,10 +64,10 @@ class PlaneAppearance(Problem):
         return jnp.where(known, values, 0.0), known
 
     def residual(self, state: Appearance) -> Float[Array, " n"]:
-        """Whitened differences; zero for points that are not seen."""
-        seen, known = self.look(state.pose)
-        expected = self.mean + self.spread * (state.gain * self.values + state.bias)
-        return jnp.where(known, (seen - expected) / self.sigma, 0.0)
+        """Whitened differences; zero for invisible points."""
+        values, known = self.sample(state.pose)
+        expected = self.mean + self.contrast * (state.gain * self.values + state.bias)
+        return jnp.where(known, (values - expected) / self.sigma, 0.0)
 
 
 @eqx.filter_jit
@@ -82,7 +82,7 @@ def refine_pose(
     levels: int = 3,
     stride: int = 2,
 ) -> Estimate:
-    """Pose of a camera from its image of a textured plane, starting at a guess.
+    """Pose of a camera from its image of a textured plane and an initial pose.
 
     Minimizes ``sum rho((image(project(T^-1 X_i)) - gain Z_i - bias) / sigma)`` over the pose ``T = T_world_camera``,
     gain and bias, for the map's pixels X_i with gray levels Z_i, from coarse to fine.
@@ -91,15 +91,15 @@ def refine_pose(
         image: the camera's image, gray levels.
         plane: the map.
         camera: intrinsics and lens.
-        initial: guess of ``T_world_camera``.
-        sigma: standard deviation of a difference, gray levels: noise of the image, faults of the map.
+        initial: ``T_world_camera``.
+        sigma: standard deviation of a difference, gray levels: noise of the image and errors of the map.
         loss: robust kernel, in sigmas.
         levels: of the pyramid; static.
-        stride: of the map's pixels that are compared at the finest level; static.
+        stride: between the map's pixels that are used at the finest level; static.
 
     Returns:
         Estimate of ``T_world_camera`` with covariance in its tangent (right perturbation). ``ok`` is False when less
-        than a tenth of the map is seen or the texture leaves directions undetermined.
+        than a tenth of the map is visible or the texture leaves directions undetermined.
 
     References:
         Kelly's image prediction as a map [K-11, K-12, K-45]; Lucas and Kanade, 1981.
@@ -111,20 +111,20 @@ def refine_pose(
         >>> camera = jl.sensors.Pinhole(100.0, 100.0, 47.5, 47.5)
         >>> truth = jl.poses.SE3.exp(jnp.array([0.95, 0.95, -1.5, 0.0, 0.0, 0.05]))
         >>> image = plane.predict(camera, truth, shape=(96, 96)).image
-        >>> start = truth @ jl.poses.SE3.exp(jnp.array([0.03, -0.02, 0.05, 0.01, 0.0, 0.01]))
-        >>> fit = jl.alignment.plane_pose.refine_pose(image, plane, camera, start)
+        >>> initial = truth @ jl.poses.SE3.exp(jnp.array([0.03, -0.02, 0.05, 0.01, 0.0, 0.01]))
+        >>> fit = jl.alignment.plane_pose.refine_pose(image, plane, camera, initial)
         >>> bool(fit.ok), bool(jnp.linalg.norm(fit.value.translation - truth.translation) < 0.01)
         (True, True)
     """
     image = as_gray(image, plane.texture.dtype)
-    pictures, maps = gaussian_pyramid(image, levels=levels), gaussian_pyramid(plane.texture, levels=levels)
+    images, maps = gaussian_pyramid(image, levels=levels), gaussian_pyramid(plane.texture, levels=levels)
     one = jnp.ones((), image.dtype)
     state = Appearance(initial, one, jnp.zeros_like(one))
     sigma = jnp.asarray(sigma, image.dtype)
     fit, problem = None, None
     for level in reversed(range(levels)):
-        problem = _problem(pictures[level], maps[level], plane, camera, level, sigma, loss, stride if level == 0 else 1)
-        # Gray levels between pixels are smooth but not quadratic: no more digits are to be had than these.
+        problem = _problem(images[level], maps[level], plane, camera, level, sigma, loss, stride if level == 0 else 1)
+        # Interpolated gray levels are not quadratic, which limits the accuracy.
         solver = LevenbergMarquardt(rtol=1e-4 if image.dtype == jnp.float32 else 1e-7)
         fit = solve(problem, state, solver=solver)
         state = fit.value
@@ -145,11 +145,11 @@ def _problem(
     u, v = jnp.meshgrid(*(jnp.arange(0, size, stride, dtype=texture.dtype) for size in texture.shape[::-1]))
     points = plane.points(shrink * jnp.stack([u.reshape(-1), v.reshape(-1)], axis=1))
     values = texture[::stride, ::stride].reshape(-1)
-    mean, spread = jnp.mean(values), jnp.std(values)
-    spread = jnp.where(spread > 0, spread, 1.0)
+    mean, contrast = jnp.mean(values), jnp.std(values)
+    contrast = jnp.where(contrast > 0, contrast, 1.0)
     focal = camera.fx / shrink, camera.fy / shrink
     scaled = Pinhole(*focal, camera.cx / shrink, camera.cy / shrink, camera.skew / shrink, camera.lens)
-    return PlaneAppearance(scaled, image, points.T, (values - mean) / spread, spread, mean, sigma, loss)
+    return PlaneAppearance(scaled, image, points.T, (values - mean) / contrast, contrast, mean, sigma, loss)
 
 
 def _pose_of(fit: Estimate, problem: PlaneAppearance) -> Estimate:
@@ -158,6 +158,6 @@ def _pose_of(fit: Estimate, problem: PlaneAppearance) -> Estimate:
     across = info[:6, 6:]
     solver = factor(info[6:, 6:])
     kept = info[:6, :6] - matmul(across, jnp.stack([solver.solve(row) for row in across], axis=1))
-    _, known = problem.look(fit.value.pose)
+    _, known = problem.sample(fit.value.pose)
     ok = fit.ok & (jnp.mean(known) >= 0.1) & (fit.value.gain > 0)
     return Estimate(fit.value.pose, fit.covariance[:6, :6], fit.cost, ok, fit.num_steps, fit.status, kept)

@@ -1,4 +1,6 @@
-"""Subpixel refinement of matched patches: brightness-proof Gauss-Newton with a covariance for every point."""
+"""Subpixel refinement of matched patches: Gauss-Newton with gain and bias, and a covariance for every point."""
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -10,52 +12,38 @@ from jaxloc.images.interpolation import AbstractInterpolation, Bilinear, inside_
 from jaxloc.images.patches import extract, slice_windows
 
 
-class RefinedColumns(eqx.Module):
-    """Right-image positions of stereo matches.
-
-    Attributes:
-        uv: Refined pixels in the right image, in the row of the left point; the guess where not ok (zero if that is off
-            the image).
-        residual: Root mean square of the gray-level difference that gain and bias leave.
-        variance: Variance of the column, px^2.
-        correlation: Normalized correlation of both patches, -1 to 1.
-        ok: True where the refinement may be trusted.
-    """
-
-    uv: Float[Array, "n 2"]
-    residual: Float[Array, " n"]
-    variance: Float[Array, " n"]
-    correlation: Float[Array, " n"]
-    ok: Bool[Array, " n"]
-
-
 class RefinedPoints(eqx.Module):
-    """Positions of matched points in a second image.
+    """Refined positions of matched points in a second image.
 
     Attributes:
-        uv: Refined pixels in the second image; the guess where not ok (zero if that is off the image).
-        residual: Root mean square of the gray-level difference that gain and bias leave.
-        covariance: Covariance of `uv`, px^2.
+        uv: Refined pixels; the initial value where not ok (zero if that is off the image).
+        residual: Root mean square of the gray-level difference after the fit of gain and bias.
+        covariance: Of the refined coordinates, px^2: of both (d = 2), or of the column alone (d = 1, stereo).
         correlation: Normalized correlation of both patches, -1 to 1.
-        ok: True where the refinement may be trusted.
+        ok: True where the refinement is valid.
     """
 
     uv: Float[Array, "n 2"]
     residual: Float[Array, " n"]
-    covariance: Float[Array, "n 2 2"]
+    covariance: Float[Array, "n d d"]
     correlation: Float[Array, " n"]
     ok: Bool[Array, " n"]
+
+    @property
+    def variance(self) -> Array:
+        """Variance of the column, px^2."""
+        return self.covariance[..., 0, 0]
 
 
 class PatchRefinement(eqx.Module):
-    """How matched patches are refined.
+    """Options of the refinement of patches.
 
     Attributes:
         size: Odd side of a patch, px.
         reach: Greatest correction, px.
         num_steps: Gauss-Newton steps before the last, which is a Newton step.
-        min_correlation: Least correlation of a trusted result.
-        least_sigma: Standard deviation of what the patch's noise does not show (interpolation, slanted surfaces), px.
+        min_correlation: Least correlation of a valid result.
+        least_sigma: Standard deviation of errors that the residual does not show (interpolation, slant), px.
         method: Interpolation of both images; `Bicubic()` costs twice the time and gains little.
     """
 
@@ -71,27 +59,27 @@ def refine_stereo(
     left: Float[Array, "h w"],
     right: Float[Array, "h w"],
     uv_left: Float[Array, "n 2"],
-    uv_right: Float[Array, "n 2"],
+    initial: Float[Array, "n 2"],
     *,
     options: PatchRefinement = PatchRefinement(),  # noqa: B008 (an immutable record)
-) -> RefinedColumns:
+) -> RefinedPoints:
     """Refines the columns of stereo matches in a rectified pair.
 
     Minimizes `sum (I_right(x + d) - g I_left(x) - b)^2` over the column of d, with gain g and bias b of every patch
     eliminated in closed form; each step costs one shift of a slice along its row. The derivative is the left patch's
     (inverse composition), so that the normal equations are formed once. Gradients are those of the solution, by the
-    implicit function theorem; the guess has none.
+    implicit function theorem; the initial value has none.
 
     Args:
         left: Left image, gray levels.
         right: Right image, of the same rectified pair.
         uv_left: Pixels in the left image.
-        uv_right: Guesses in the right image, within `options.reach` px of the truth; only their columns are used.
-        options: Patch size, reach, steps and trust.
+        initial: Pixels in the right image, within `options.reach` px of the truth; only their columns are used.
+        options: Patch size, reach, steps and thresholds.
 
     Returns:
-        Refined pixels with residual, variance, correlation and trust. The variance is
-        `s^2 / (g^2 sum I_u^2)` with s^2 the residual's mean square; add the spread of detector and scene if needed.
+        Refined pixels with the variance of the column, `s^2 / (g^2 sum I_u^2)` with s^2 the residual's mean square; add
+        the variance of detector and scene if needed.
 
     References:
         Subpixel localization drives depth accuracy [T-10]; Baker and Matthews, "Lucas-Kanade 20 years on" (2004).
@@ -105,33 +93,33 @@ def refine_stereo(
         >>> round(float(found.uv[0, 0]), 1), bool(found.ok[0])
         (25.7, True)
     """
-    return _refine_stereo(left, right, uv_left, uv_right, options)
+    return _refine_stereo(left, right, uv_left, initial, options)
 
 
 def refine_translation(
     previous: Float[Array, "h w"],
     current: Float[Array, "h w"],
     uv_previous: Float[Array, "n 2"],
-    uv_current: Float[Array, "n 2"],
+    initial: Float[Array, "n 2"],
     *,
     options: PatchRefinement = PatchRefinement(),  # noqa: B008 (an immutable record)
 ) -> RefinedPoints:
-    """Refines where points of one image are seen in another, as pure translations of their patches.
+    """Refines matches between two images by pure translations of their patches.
 
     Minimizes `sum (I_current(x + d) - g I_previous(x) - b)^2` over both coordinates of d, with gain g and bias b of
-    every patch eliminated in closed form (inverse composition). Gradients are those of the solution; the guess has
-    none.
+    every patch eliminated in closed form (inverse composition). Gradients are those of the solution; the initial value
+    has none.
 
     Args:
         previous: First image, gray levels.
         current: Second image.
         uv_previous: Pixels in the first image.
-        uv_current: Guesses in the second image, within `options.reach` px of the truth.
-        options: Patch size, reach, steps and trust.
+        initial: Pixels in the second image, within `options.reach` px of the truth.
+        options: Patch size, reach, steps and thresholds.
 
     Returns:
-        Refined pixels with residual, covariance, correlation and trust. The covariance is `s^2 / g^2 H^-1` with s^2 the
-        residual's mean square and H the patch's structure matrix.
+        Refined pixels with covariance `s^2 / g^2 H^-1`, s^2 the residual's mean square and H the patch's structure
+        matrix.
 
     References:
         Baker and Matthews, "Lucas-Kanade 20 years on" (2004), sections 3.2 and 4.
@@ -145,42 +133,29 @@ def refine_translation(
         >>> [round(x, 1) for x in found.uv[0].tolist()], bool(found.ok[0])
         ([30.7, 19.6], True)
     """
-    return _refine_translation(previous, current, uv_previous, uv_current, options)
+    return _refine_translation(previous, current, uv_previous, initial, options)
 
 
 @eqx.filter_jit
-def _refine_stereo(left, right, uv_left, uv_right, options: PatchRefinement) -> RefinedColumns:
-    guess = jnp.stack([uv_right[:, 0], uv_left[:, 1]], axis=1)
-    template = _template(left, uv_left, 1, options)
-    fit = _fit(right, template, guess, 1, options)
-    return RefinedColumns(fit.uv, fit.residual, fit.covariance[0][0], fit.correlation, fit.ok)
+def _refine_stereo(left, right, uv_left, initial, options: PatchRefinement) -> RefinedPoints:
+    initial = jnp.stack([initial[:, 0], uv_left[:, 1]], axis=1)
+    return _fit(right, _template(left, uv_left, 1, options), initial, 1, options)
 
 
 @eqx.filter_jit
-def _refine_translation(previous, current, uv_previous, uv_current, options: PatchRefinement) -> RefinedPoints:
-    template = _template(previous, uv_previous, 2, options)
-    fit = _fit(current, template, uv_current, 2, options)
-    covariance = jnp.stack([jnp.stack(row, axis=-1) for row in fit.covariance], axis=-2)
-    return RefinedPoints(fit.uv, fit.residual, covariance, fit.correlation, fit.ok)
+def _refine_translation(previous, current, uv_previous, initial, options: PatchRefinement) -> RefinedPoints:
+    return _fit(current, _template(previous, uv_previous, 2, options), initial, 2, options)
 
 
 class _Template(eqx.Module):
-    """Patches with points along the last, fast axis, and what Gauss-Newton needs of them once."""
+    """Patches with points along the last, fast axis, and the constant parts of their normal equations."""
 
     centered: Float[Array, "p q n"]
     energy: Float[Array, " n"]
     slopes: tuple[Float[Array, "p q n"], ...]
-    leaks: tuple[Float[Array, " n"], ...]
+    gain_slopes: tuple[Float[Array, " n"], ...]
     inverse: tuple[tuple[Float[Array, " n"], ...], ...]
     kept_noise: Float[Array, " n"]
-    ok: Bool[Array, " n"]
-
-
-class _Fit(eqx.Module):
-    uv: Float[Array, "n 2"]
-    residual: Float[Array, " n"]
-    covariance: tuple[tuple[Float[Array, " n"], ...], ...]
-    correlation: Float[Array, " n"]
     ok: Bool[Array, " n"]
 
 
@@ -196,24 +171,22 @@ def _template(image, uv, unknowns: int, options: PatchRefinement) -> _Template:
     mean = inner.mean(axis=(0, 1))
     centered = inner - mean[None, None, :]
     energy = _dot(centered, centered)
-    # Rounding leaves a flat patch with a little energy, in proportion to its brightness.
+    # Rounding gives a constant patch a small energy, in proportion to its brightness.
     textured = energy > 1e-6 * options.size**2 * (mean * mean + 1e-6)
     energy = jnp.where(textured, energy, 1.0)
     slopes = [0.5 * (wide[1:-1, 2:] - wide[1:-1, :-2]), 0.5 * (wide[2:, 1:-1] - wide[:-2, 1:-1])][:unknowns]
-    leaks = [_dot(slope, centered) / energy for slope in slopes]
+    gain_slopes = [_dot(slope, centered) / energy for slope in slopes]
     slopes = [
-        slope - slope.mean(axis=(0, 1))[None, None, :] - leak[None, None, :] * centered
-        for slope, leak in zip(slopes, leaks, strict=True)
+        slope - slope.mean(axis=(0, 1))[None, None, :] - gain_slope[None, None, :] * centered
+        for slope, gain_slope in zip(slopes, gain_slopes, strict=True)
     ]
     inverse, regular = _inverse([[_dot(a, b) for b in slopes] for a in slopes], energy)
     ok = patches.inside & textured & regular
-    return _Template(centered, energy, tuple(slopes), tuple(leaks), inverse, _kept_noise(uv, ok, options), ok)
+    return _Template(centered, energy, tuple(slopes), tuple(gain_slopes), inverse, _kept_noise(uv, ok, options), ok)
 
 
 def _kept_noise(uv, ok, options: PatchRefinement):
-    """Share of the pixels' noise variance that interpolation lets through: `sum w^2` along rows times columns."""
-    corner = jnp.where(ok[:, None], uv - 0.5 * (options.size - 1), 0.0)
-    return jnp.prod(sum(w * w for w in options.method.weights(corner - jnp.floor(corner))), axis=1)
+    return options.method.noise_gain(jnp.where(ok[:, None], uv - 0.5 * (options.size - 1), 0.0))
 
 
 def _inverse(gram, energy):
@@ -229,28 +202,26 @@ def _inverse(gram, energy):
     return ((c / divisor, -b / divisor), (-b / divisor, a / divisor)), regular
 
 
-def _fit(image, template: _Template, guess, unknowns: int, options: PatchRefinement) -> _Fit:
-    """Gauss-Newton on all patches at once, a fixed number of steps, and one Newton step that carries the gradient."""
-    on_image = inside_image(guess, image.shape)
-    guess = jnp.where(on_image[:, None], guess, 0.0)
-    windows, base = _windows(image, guess, unknowns, options)
+def _fit(image, template: _Template, initial, unknowns: int, options: PatchRefinement) -> RefinedPoints:
+    """A fixed number of Gauss-Newton steps on all patches at once, and one Newton step that has the derivatives."""
+    on_image = inside_image(initial, image.shape)
+    initial = jnp.where(on_image[:, None], initial, 0.0)
+    windows, base = _windows(image, initial, unknowns, options)
     frozen = lax.stop_gradient((template, windows))
 
     def advance(_, offset):
         step = jnp.clip(_regress(*frozen, offset, options)[2], -1.0, 1.0)
         return jnp.clip(offset - step, -options.reach, options.reach)
 
-    start = lax.stop_gradient(guess[:, :unknowns] - base[:, :unknowns])
-    offset = lax.fori_loop(0, options.num_steps, advance, start)
-    # At the solution the step is zero, so that one Newton step has the gradient of the solution (implicit function
-    # theorem): the loop need not be differentiated.
-    slope = _slope(lambda moved: _regress(*frozen, moved, options)[2], offset)
+    first = lax.stop_gradient(initial[:, :unknowns] - base[:, :unknowns])
+    offset = lax.fori_loop(0, options.num_steps, advance, first)
+    inverse, _ = newton_inverse(lambda moved: _regress(*frozen, moved, options)[2], offset)
     step = _regress(template, windows, offset, options)[2]
-    offset = offset - jnp.clip(_divide(step, slope), -1.0, 1.0)
+    offset = offset - jnp.clip(jnp.sum(inverse * step[:, None, :], axis=2), -1.0, 1.0)
     patch, gain, last = _regress(template, windows, offset, options)
-    uv = jnp.concatenate([base[:, :unknowns] + offset, guess[:, unknowns:]], axis=1)
+    uv = jnp.concatenate([base[:, :unknowns] + offset, initial[:, unknowns:]], axis=1)
     settled = jnp.all((jnp.abs(last) < 0.05) & (jnp.abs(offset) < options.reach), axis=1)
-    return _judge(template, patch, gain, uv, guess, settled & on_image & template.ok, image.shape, options)
+    return _validate(template, patch, gain, uv, initial, settled & on_image & template.ok, image.shape, options)
 
 
 def _regress(template: _Template, windows, offset, options: PatchRefinement):
@@ -259,34 +230,50 @@ def _regress(template: _Template, windows, offset, options: PatchRefinement):
     along = [_dot(slope, patch) for slope in template.slopes]
     steps = [sum(w * x for w, x in zip(row, along, strict=True)) for row in template.inverse]
     gain = _dot(template.centered, patch) / template.energy
-    gain = gain - sum(leak * step for leak, step in zip(template.leaks, steps, strict=True))
-    # A step divided by a gain near zero would be thrown far away.
+    gain = gain - sum(gain_slope * step for gain_slope, step in zip(template.gain_slopes, steps, strict=True))
+    # A gain near zero would give a huge step.
     return patch, gain, jnp.stack(steps, axis=1) / jnp.maximum(gain, 0.25)[:, None]
 
 
-def _slope(step, offset):
-    """Derivative of each point's step by its own offset, column by column."""
+def newton_inverse(
+    step: Callable[[Array], Array], offset: Float[Array, "n d"]
+) -> tuple[Float[Array, "n d d"], Bool[Array, " n"]]:
+    """Inverse derivative of Gauss-Newton steps by the offsets that they correct, for one last Newton step.
+
+    At the solution the step is zero: ``offset - inverse @ step(offset)`` has the derivatives of the solution (implicit
+    function theorem), so that the iterations before it need not be differentiated.
+
+    Args:
+        step: steps "n d" that are subtracted from the offsets, each a function of its own offset; d is 1 or 2.
+        offset: where the iterations ended.
+
+    Returns:
+        The inverses, and where the derivatives are near enough to the identity; the identity elsewhere.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> inverse, regular = newton_inverse(lambda x: 2.0 * (x - 3.0), jnp.ones((1, 2)))
+        >>> jnp.abs(inverse).tolist(), regular.tolist()
+        ([[[0.5, 0.0], [0.0, 0.5]]], [True])
+    """
     unit = jnp.eye(offset.shape[1], dtype=offset.dtype)
-    return [jax.jvp(step, (offset,), (jnp.broadcast_to(row[None, :], offset.shape),))[1] for row in unit]
-
-
-def _divide(step, slope):
-    """Solves `slope @ x = step` for each point; where the slope is far from the identity, x is the step itself."""
-    if len(slope) == 1:
-        (a,) = slope
-        return step / jnp.where(a > 0.3, a, 1.0)
-    (a, b), (c, d) = ((column[:, 0], column[:, 1]) for column in slope)
+    columns = [jax.jvp(step, (offset,), (jnp.broadcast_to(row[None, :], offset.shape),))[1] for row in unit]
+    if len(columns) == 1:
+        regular = columns[0][:, 0] > 0.3
+        return 1.0 / jnp.where(regular, columns[0][:, 0], 1.0)[:, None, None], regular
+    (a, b), (c, d) = ((column[:, 0], column[:, 1]) for column in columns)
     determinant = a * d - b * c
-    near = ((a + d > 0.6) & (determinant > 0.1))[:, None]
-    solved = jnp.stack([d * step[:, 0] - c * step[:, 1], a * step[:, 1] - b * step[:, 0]], axis=1)
-    return jnp.where(near, solved / jnp.where(near, determinant[:, None], 1.0), step)
+    regular = (a + d > 0.6) & (determinant > 0.1)
+    adjugate = jnp.stack([jnp.stack([d, -c], axis=1), jnp.stack([-b, a], axis=1)], axis=1)
+    inverse = adjugate / jnp.where(regular, determinant, 1.0)[:, None, None]
+    return jnp.where(regular[:, None, None], inverse, unit[None]), regular
 
 
-def _judge(template: _Template, patch, gain, uv, guess, ok, shape, options: PatchRefinement) -> _Fit:
-    """Residual, covariance and trust of the final positions."""
+def _validate(template: _Template, patch, gain, uv, initial, ok, shape, options: PatchRefinement) -> RefinedPoints:
+    """Residual, covariance and validity of the final positions."""
     centered = patch - patch.mean(axis=(0, 1))[None, None, :]
-    left_over = centered - gain[None, None, :] * template.centered
-    squares, energy = _dot(left_over, left_over), _dot(centered, centered)
+    difference = centered - gain[None, None, :] * template.centered
+    squares, energy = _dot(difference, difference), _dot(centered, centered)
     pixels, unknowns = options.size**2, len(template.slopes)
     # Interpolated noise is smaller but correlated; on the (smooth) slopes it weighs as much as before interpolation.
     kept = gain * gain * template.kept_noise + _kept_noise(uv, ok, options)
@@ -298,38 +285,38 @@ def _judge(template: _Template, patch, gain, uv, guess, ok, shape, options: Patc
     ok = ok & inside & (gain > 0.25) & (gain < 4.0) & (correlation >= options.min_correlation)
     weight = noise / jnp.where(ok, gain * gain, 1.0)
     floor = options.least_sigma**2
-    covariance = tuple(
-        tuple(jnp.where(ok, weight * w + floor * (i == j), float(i == j)) for j, w in enumerate(row))
+    covariance = [
+        jnp.stack([jnp.where(ok, weight * w + floor * (i == j), float(i == j)) for j, w in enumerate(row)], axis=1)
         for i, row in enumerate(template.inverse)
-    )
-    # The root of a perfect match's zero has no gradient; zero is taken there.
+    ]
+    # The root of a perfect match's zero has no gradient; zero is used there.
     some = ok & (squares > 0)
     residual = jnp.where(some, jnp.sqrt(jnp.where(some, squares / pixels, 1.0)), 0.0)
-    uv = jnp.where(ok[:, None], uv, guess)
-    return _Fit(uv, residual, covariance, jnp.where(ok, correlation, 0.0), ok)
+    uv = jnp.where(ok[:, None], uv, initial)
+    return RefinedPoints(uv, residual, jnp.stack(covariance, axis=1), jnp.where(ok, correlation, 0.0), ok)
 
 
-def _windows(image, guess, unknowns: int, options: PatchRefinement):
-    """Slices with room to move, points last, and the pixel about which each can move."""
+def _windows(image, initial, unknowns: int, options: PatchRefinement):
+    """Slices with a margin for the search, points last, and the pixel in the middle of each."""
     method, half, reach = options.method, options.size // 2, options.reach
     margin = half + reach + method.taps
     padded = jnp.pad(image, margin, mode="edge")
-    room = 2 * reach + method.taps - 1
-    column = jnp.round(guess[:, 0])
-    row = jnp.round(guess[:, 1]) if unknowns == 2 else jnp.floor(guess[:, 1])
+    extent = 2 * reach + method.taps - 1
+    column = jnp.round(initial[:, 0])
+    row = jnp.round(initial[:, 1]) if unknowns == 2 else jnp.floor(initial[:, 1])
     base = jnp.stack([column, row], axis=1)
     back = jnp.array([half + reach, half + (reach if unknowns == 2 else 0)], dtype=jnp.int32) - method.first
     corner = base.astype(jnp.int32) - back[None, :] + margin
-    rows = options.size + (room if unknowns == 2 else method.taps - 1)
-    windows = jnp.transpose(slice_windows(padded, corner, (rows, options.size + room)), (1, 2, 0))
+    rows = options.size + (extent if unknowns == 2 else method.taps - 1)
+    windows = jnp.transpose(slice_windows(padded, corner, (rows, options.size + extent)), (1, 2, 0))
     if unknowns == 1:
-        weights = method.weights((guess[:, 1] - row).astype(image.dtype))
+        weights = method.weights((initial[:, 1] - row).astype(image.dtype))
         windows = sum(w[None, None, :] * windows[k : k + options.size] for k, w in enumerate(weights))
     return windows, base
 
 
 def _shift(windows, offset, options: PatchRefinement):
-    """Patches at `offset` from the windows' centers: slices that do not move, with weights that do."""
+    """Patches at `offset` from the windows' centers: fixed slices with weights that depend on the offset."""
     if offset.shape[1] == 2:
         weights = _moving_weights(offset[:, 1], options)
         windows = sum(w[None, None, :] * windows[k : k + options.size] for k, w in enumerate(weights))
@@ -341,6 +328,6 @@ def _moving_weights(offset, options: PatchRefinement):
     """Weights of all pixels that a patch may need within reach; only `taps` of them are not zero."""
     whole = jnp.floor(offset)
     near = options.method.weights(offset - whole)
-    start = whole.astype(jnp.int32) + options.reach
+    index = whole.astype(jnp.int32) + options.reach
     count = 2 * options.reach + options.method.taps
-    return [sum(jnp.where(start == k - tap, weight, 0.0) for tap, weight in enumerate(near)) for k in range(count)]
+    return [sum(jnp.where(index == k - tap, weight, 0.0) for tap, weight in enumerate(near)) for k in range(count)]

@@ -1,7 +1,7 @@
-"""Nonlinear diffusion: smoothing that stops at edges, by fast explicit and by additive implicit steps.
+"""Nonlinear, edge-preserving diffusion by fast explicit and by additive implicit steps.
 
-``dL/dt = div(g(|grad L_s|) grad L)`` with a conductivity g that falls where the image, itself smoothed a little, is
-steep. Time t smooths flat parts like a Gaussian of variance ``2 t``. It is the scale space of KAZE and A-KAZE.
+``dL/dt = div(g(|grad L_s|) grad L)`` with a conductivity g that decreases with the gradient of the slightly smoothed
+image. In flat regions, time t smooths like a Gaussian of variance ``2 t``. It is the scale space of KAZE and A-KAZE.
 
 References:
     Perona and Malik, T-PAMI 1990; Weickert, ter Haar Romeny, Viergever, "Efficient and reliable schemes for nonlinear
@@ -18,12 +18,12 @@ from jaxtyping import Array, Float
 
 from jaxloc.images.gradients import scharr, smooth
 
-# Explicit steps of the five-point scheme are stable up to this, for conductivities up to one.
+# Largest stable explicit step of the five-point scheme, for conductivities up to one.
 LARGEST_STEP = 0.25
 
 
 class Conductivity(eqx.Module):
-    """How well a pixel conducts, given its squared gradient over the squared contrast; one where flat."""
+    """Conductivity function of the squared gradient over the squared contrast; one where flat."""
 
     @abstractmethod
     def of(self, ratio: Float[Array, "h w"]) -> Float[Array, "h w"]:
@@ -70,7 +70,7 @@ _PERONA_MALIK = PeronaMalik()
 def contrast(
     image: Float[Array, "h w"], *, percentile: float | Float[Array, ""] = 70.0, sigma: float = 1.0
 ) -> Float[Array, ""]:
-    """The gradient that divides edges from noise: a percentile of those of the smoothed image.
+    """Contrast parameter between noise and edges: a percentile of the gradients of the smoothed image.
 
     Args:
         image: gray levels.
@@ -125,10 +125,10 @@ def conductance(
 
 
 def fed_steps(time: float, *, largest: float = LARGEST_STEP, cycles: int = 1) -> tuple[float, ...]:
-    """Steps of fast explicit diffusion: unstable ones among them, stable together, and their sum is the time exactly.
+    """Time steps of fast explicit diffusion: stable as a cycle, with the time as their exact sum.
 
-    ``n`` steps of a cycle reach ``(n^2 + n) / 3`` times the largest stable step: a box filter in disguise. They are
-    ordered so that errors of rounding do not grow in between.
+    ``n`` steps of a cycle sum to ``(n^2 + n) / 3`` times the largest stable step (a factorized box filter). They are
+    ordered to limit rounding errors in between.
 
     Args:
         time: diffusion time of all cycles.
@@ -155,12 +155,12 @@ def fed_steps(time: float, *, largest: float = LARGEST_STEP, cycles: int = 1) ->
     count = math.ceil(math.sqrt(3.0 * part / largest + 0.25) - 0.5 - 1e-12)
     scale = 3.0 * part / (largest * (count * count + count))
     steps = [0.5 * scale * largest / math.cos(math.pi * (2 * i + 1) / (4 * count + 2)) ** 2 for i in range(count)]
-    # Every k-th in turn modulo a prime, as Leja would nearly order them.
+    # Every k-th modulo a prime, which approximates Leja ordering.
     prime = next(p for p in range(count + 1, 2 * count + 3) if all(p % q for q in range(2, int(p**0.5) + 1)))
     stride = max(count // 2, 1)
     order = [i for i in ((k * stride) % prime - 1 for k in range(1, prime + 1)) if 0 <= i < count]
     steps = [steps[i] for i in order]
-    # The sum is the time to the last bit.
+    # Scaled so that the sum is exactly the time.
     steps[-1] += part - math.fsum(steps)
     return tuple(steps)
 
@@ -187,8 +187,8 @@ def diffuse_explicit(
     Example:
         >>> import jax.numpy as jnp
         >>> spot = jnp.zeros((9, 9)).at[4, 4].set(1.0)
-        >>> spread = diffuse_explicit(spot, jnp.ones((9, 9)), jnp.asarray(fed_steps(1.0)))
-        >>> round(float(spread.sum()), 4), bool(spread[4, 4] < 0.2)
+        >>> diffused = diffuse_explicit(spot, jnp.ones((9, 9)), jnp.asarray(fed_steps(1.0)))
+        >>> round(float(diffused.sum()), 4), bool(diffused[4, 4] < 0.2)
         (1.0, True)
     """
     return lax.scan(lambda now, step: (now + step * _flow(now, conductance), None), image, steps)[0]
@@ -200,7 +200,7 @@ def diffuse_implicit(
 ) -> Float[Array, "h w"]:
     """One additive operator splitting step: ``L <- (1/2) sum over both axes of (I - 2 tau A)^-1 L``.
 
-    Each axis is a tridiagonal system, solved along it for all lines at once. Any size of the step is stable.
+    Each axis is a tridiagonal system, solved for all lines at once. Steps of any size are stable.
 
     Args:
         image: gray levels.
@@ -222,12 +222,12 @@ def diffuse_implicit(
 
 
 def _solve_lines(image: Float[Array, "h w"], conductance: Float[Array, "h w"], step: Array) -> Float[Array, "h w"]:
-    """``(I - 2 tau A)^-1`` along columns, by Thomas's algorithm: diagonally dominant, so no pivots are sought."""
+    """``(I - 2 tau A)^-1`` along columns, by Thomas's algorithm; diagonally dominant, so without pivoting."""
     between = step * (conductance[1:] + conductance[:-1])
     above, below = jnp.pad(between, ((1, 0), (0, 0))), jnp.pad(between, ((0, 1), (0, 0)))
 
-    def eliminate(carried: tuple[Array, Array], row: tuple[Array, Array, Array]) -> tuple[tuple, tuple]:
-        ratio, value = carried
+    def eliminate(state: tuple[Array, Array], row: tuple[Array, Array, Array]) -> tuple[tuple, tuple]:
+        ratio, value = state
         up, low, right = row
         pivot = 1.0 + up + low - up * ratio
         new = low / pivot, (right + up * value) / pivot
@@ -248,16 +248,16 @@ def _solve_lines(image: Float[Array, "h w"], conductance: Float[Array, "h w"], s
 def diffuse(
     image: Float[Array, "h w"], *, sigma: float, kind: Conductivity = _PERONA_MALIK, cycles: int = 4
 ) -> Float[Array, "h w"]:
-    """Smooths flat parts like a Gaussian of deviation sigma and keeps edges, by cycles of fast explicit diffusion.
+    """Edge-preserving smoothing by cycles of fast explicit diffusion, in flat regions like a Gaussian.
 
     Args:
         image: gray levels.
-        sigma: deviation of the Gaussian that would smooth flat parts as much, px; static.
+        sigma: standard deviation of that Gaussian, px; static.
         kind: conductivity.
-        cycles: times that the conductivity is computed; static.
+        cycles: number of evaluations of the conductivity; static.
 
     Returns:
-        The smoothed image. Derivatives flow through the steps, not through the contrast.
+        The smoothed image. Differentiable through the steps, not through the contrast.
 
     References:
         Alcantarilla, Nuevo, Bartoli, "Fast explicit diffusion for accelerated features in nonlinear scale spaces",

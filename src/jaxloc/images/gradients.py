@@ -1,4 +1,4 @@
-"""Image derivatives and Gaussian smoothing by separable kernels, borders reflected as OpenCV reflects them."""
+"""Image derivatives and Gaussian smoothing by separable kernels, with borders reflected as in OpenCV."""
 
 import math
 
@@ -24,7 +24,7 @@ def central_difference(image: Float[Array, "h w"]) -> ImageGradient:
     """Differentiates by `(I[x + 1] - I[x - 1]) / 2`.
 
     Args:
-        image: Gray image.
+        image: Grayscale image.
 
     Returns:
         Both derivatives, in gray levels a pixel; zero across the reflected border.
@@ -43,7 +43,7 @@ def sobel(image: Float[Array, "h w"]) -> ImageGradient:
     """Differentiates with Sobel's 3x3 kernel, scaled to gray levels a pixel: `cv2.Sobel(ksize=3) / 8`.
 
     Args:
-        image: Gray image.
+        image: Grayscale image.
 
     Returns:
         Both derivatives.
@@ -62,10 +62,10 @@ def scharr(image: Float[Array, "h w"]) -> ImageGradient:
     """Differentiates with Scharr's 3x3 kernel, scaled to gray levels a pixel: `cv2.Scharr / 32`.
 
     Args:
-        image: Gray image.
+        image: Grayscale image.
 
     Returns:
-        Both derivatives; their direction depends less on orientation than Sobel's.
+        Both derivatives; more isotropic than Sobel's.
 
     References:
         Scharr, "Optimal operators in digital image processing" (2000).
@@ -83,12 +83,12 @@ def scharr(image: Float[Array, "h w"]) -> ImageGradient:
 def smooth(
     image: Float[Array, "h w"], sigma: float | int | Float[Array, ""], *, radius: int | None = None
 ) -> Float[Array, "h w"]:
-    """Smooths with a Gaussian, cut at `radius` pixels and normalized: `cv2.GaussianBlur` of size `2 radius + 1`.
+    """Smooths with a Gaussian, truncated at `radius` pixels and normalized: `cv2.GaussianBlur` of size `2 radius + 1`.
 
     Args:
-        image: Gray image.
+        image: Grayscale image.
         sigma: Standard deviation in pixels. A Python number fixes it at trace time, an array can be differentiated.
-        radius: Static reach of the kernel; three sigma by default, needed when `sigma` is an array.
+        radius: Static radius of the kernel; three sigma by default, needed when `sigma` is an array.
 
     Returns:
         The smoothed image, borders reflected about the border pixel.
@@ -105,7 +105,7 @@ def smooth(
     if radius is None:
         if not isinstance(sigma, float | int):
             raise ValueError("smooth: an array sigma needs a static radius, for example radius=6.")
-        # A border is reflected once: the kernel reaches no further than the image.
+        # A border is reflected once: the radius is limited by the image.
         radius = max(1, min(math.ceil(3.0 * sigma), min(image.shape) - 1))
     offsets = jnp.arange(-radius, radius + 1, dtype=image.dtype)
     weights = jnp.exp(-0.5 * (offsets / jnp.asarray(sigma, image.dtype)) ** 2)

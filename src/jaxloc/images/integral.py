@@ -1,4 +1,4 @@
-"""Integral images: the sum over any rectangle from its four corners, exact to the last bit."""
+"""Integral images: exact sums over rectangles from their four corners."""
 
 from collections.abc import Callable
 from functools import partial
@@ -11,9 +11,9 @@ from jaxtyping import Array, Float, Int, Num
 
 @eqx.filter_jit
 def integral(image: Num[Array, "h w"]) -> Num[Array, "h1 w1"]:
-    """Sums over all pixels above and to the left: ``S[i, j] = sum of image[:i, :j]``.
+    """Integral image: sums over all pixels above and to the left, ``S[i, j] = sum of image[:i, :j]``.
 
-    Sums of integers wrap around; differences of them are exact nevertheless, as long as the sum over a box fits.
+    Sums of integers may overflow; their differences are exact nevertheless, if the sum over the box fits.
 
     Args:
         image: gray levels; small integers are summed as int32.
@@ -37,7 +37,7 @@ def integral(image: Num[Array, "h w"]) -> Num[Array, "h1 w1"]:
 
 @eqx.filter_jit
 def box_sums(sums: Num[Array, "h1 w1"], boxes: Int[Array, "n 4"]) -> Num[Array, " n"]:
-    """Sums over rectangles, four reads each, whatever their size.
+    """Sums over rectangles of any size, by four reads each.
 
     Args:
         sums: an integral image.
@@ -67,13 +67,13 @@ def box_sums(sums: Num[Array, "h1 w1"], boxes: Int[Array, "n 4"]) -> Num[Array, 
 def filter_boxes(
     linear: Callable[..., tuple[Array, ...]], largest: int, image: Float[Array, "h w"], *places: Array
 ) -> tuple[Array, ...]:
-    """Box filters of an image of float32, without the rounding of sums over millions of pixels.
+    """Box filters of a float32 image without the rounding errors of sums over the whole image.
 
-    Gray levels become integers of a fixed point as fine as the largest filter allows: sums of those are exact modulo
-    2^32. An image of float64 is summed as it is. Derivatives follow the filter, which is linear.
+    Gray levels become fixed-point integers, as fine as the largest filter allows, whose sums are exact modulo
+    2^32. A float64 image is summed directly. Derivatives are those of the linear filter.
 
     Args:
-        linear: from an integral image and the places to sums of boxes; adds and subtracts only, in any dtype. Static.
+        linear: maps an integral image and places to sums of boxes by additions and subtractions, in any dtype. Static.
         largest: greatest sum of absolute weights of a filter, pixels; static.
         image: gray levels.
         places: further arguments of `linear`.
@@ -91,7 +91,7 @@ def filter_boxes(
     if image.dtype == jnp.float64:
         return linear(integral(image), *places)
     highest = jnp.maximum(jnp.max(jnp.abs(image)), jnp.asarray(1e-20, image.dtype))
-    # A power of two: whole gray levels stay exact.
+    # A power of two, so that whole gray levels are exact.
     scale = jnp.exp2(jnp.floor(jnp.log2((2.0**31 - 1.0) / largest / highest)) - 1.0)
     whole = jnp.round(image * scale).astype(jnp.int32)
     return tuple(part.astype(image.dtype) / scale for part in linear(integral(whole), *places))

@@ -1,4 +1,4 @@
-"""Image values between pixels: bilinear and bicubic sampling, differentiable in the image and in the coordinates."""
+"""Bilinear and bicubic interpolation of images, differentiable in the image and in the coordinates."""
 
 from abc import abstractmethod
 
@@ -20,7 +20,7 @@ class Sampled(eqx.Module):
 
 
 class AbstractInterpolation(eqx.Module):
-    """How the value between pixels is weighted from its neighbors, the same along rows and columns."""
+    """Interpolation kernel, the same along rows and columns."""
 
     first: eqx.AbstractClassVar[int]
     taps: eqx.AbstractClassVar[int]
@@ -29,9 +29,19 @@ class AbstractInterpolation(eqx.Module):
     def weights(self, fraction: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], ...]:
         """Weights of the pixels `floor(x) + first ... floor(x) + first + taps - 1` for `fraction = x - floor(x)`."""
 
+    def noise_gain(self, uv: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
+        """Variance of interpolated white noise over that of the pixels, `sum w^2` along rows times columns.
+
+        Example:
+            >>> import jax.numpy as jnp
+            >>> Bilinear().noise_gain(jnp.array([[3.0, 0.5], [0.5, 1.5]])).tolist()
+            [0.5, 0.25]
+        """
+        return jnp.prod(sum(w * w for w in self.weights(uv - jnp.floor(uv))), axis=-1)
+
 
 class Bilinear(AbstractInterpolation):
-    """Two pixels a direction: continuous, with a gradient that jumps at pixel centers."""
+    """Two pixels a direction: continuous, with a gradient that is discontinuous at pixel centers."""
 
     first = 0
     taps = 2
@@ -68,13 +78,13 @@ class Bicubic(AbstractInterpolation):
 def sample(
     image: Float[Array, "h w *c"], uv: Float[Array, "n 2"], *, method: AbstractInterpolation | None = None
 ) -> Sampled:
-    """Reads an image between its pixels.
+    """Samples an image at subpixel coordinates.
 
     `I(u, v) = sum_ij w_i(v) w_j(u) I[floor(v) + i, floor(u) + j]`; neighbors beyond the border repeat the border pixel.
     A point outside the image (or not finite) gives zero, is flagged, and has no gradient.
 
     Args:
-        image: Gray image, or one with any channels behind rows and columns (color, range, ...).
+        image: Grayscale image, or with channels after rows and columns (color, range, ...).
         uv: Pixel coordinates (right, down), centers at integers.
         method: `Bilinear()` (the default) or `Bicubic()`.
 
@@ -99,22 +109,24 @@ def sample(
 def sample_components(
     image: Float[Array, "h w *c"], u: Float[Array, " n"], v: Float[Array, " n"], *, method: AbstractInterpolation
 ) -> tuple[Float[Array, "n *c"], Bool[Array, " n"]]:
-    """`sample` on component arrays: values and which points lie inside. Inner loops keep coordinates apart."""
+    """`sample` on component arrays, for inner loops: values and which points lie inside."""
     height, width = image.shape[:2]
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     columns, weights_u = _neighbors(jnp.where(inside, u, 0.0), width, method)
     rows, weights_v = _neighbors(jnp.where(inside, v, 0.0), height, method)
-    flat, behind = image.reshape(height * width, *image.shape[2:]), (1,) * (image.ndim - 2)
+    flat, trailing = image.reshape(height * width, *image.shape[2:]), (1,) * (image.ndim - 2)
 
     def along(row: Int[Array, " n"]) -> Float[Array, "n *c"]:
         picked = [flat.at[row * width + column].get(mode="promise_in_bounds") for column in columns]
-        return sum(_behind(weight, image, behind) * part for weight, part in zip(weights_u, picked, strict=True))
+        return sum(_as_channels(weight, image, trailing) * part for weight, part in zip(weights_u, picked, strict=True))
 
-    values = sum(_behind(weight, image, behind) * along(row) for weight, row in zip(weights_v, rows, strict=True))
-    return jnp.where(inside.reshape(inside.shape + behind), values, 0.0), inside
+    values = sum(
+        _as_channels(weight, image, trailing) * along(row) for weight, row in zip(weights_v, rows, strict=True)
+    )
+    return jnp.where(inside.reshape(inside.shape + trailing), values, 0.0), inside
 
 
-def _behind(weight: Float[Array, " n"], image: Array, axes: tuple[int, ...]) -> Float[Array, "n *one"]:
+def _as_channels(weight: Float[Array, " n"], image: Array, axes: tuple[int, ...]) -> Float[Array, "n *one"]:
     return weight.astype(image.dtype).reshape(weight.shape + axes)
 
 
@@ -132,10 +144,10 @@ def inside_image(uv: Float[Array, "n 2"], shape: tuple[int, int]) -> Bool[Array,
 
 def _neighbors(coordinate: Float[Array, " n"], size: int, method: AbstractInterpolation):
     """Indices (border repeated) and weights of the pixels that surround each coordinate."""
-    # The last cell takes its closed end, so that a coordinate on the far border still has a gradient.
+    # The last cell includes its end, so that a coordinate on the far border has a gradient.
     base = jnp.clip(jnp.floor(coordinate).astype(jnp.int32), 0, max(size - 2, 0))
     fraction = coordinate - base.astype(coordinate.dtype)
-    # Two neighbors of a cell are never off the image, if it has two pixels.
+    # Two neighbors of a cell are never outside an image of at least two pixels.
     near = method.first == 0 and method.taps <= min(size, 2)
     indices = [base + tap if near else jnp.clip(base + method.first + tap, 0, size - 1) for tap in range(method.taps)]
     return indices, method.weights(fraction)

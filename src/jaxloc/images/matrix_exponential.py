@@ -1,4 +1,4 @@
-"""Exponential and logarithm of small matrices with a fixed number of products: no loop, batched and differentiable."""
+"""Exponential and logarithm of small matrices with a fixed number of products, batched and differentiable."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,8 +12,8 @@ _ROOTS, _ROOT_STEPS, _ODD_TERMS = 3, 7, 7
 def exponential_less_identity(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
     """``exp(A) - I``, exact to rounding for norms up to about 6.
 
-    Of a sixteenth of A by Taylor's series, then doubled four times by ``(I + E)^2 = I + (2 E + E^2)``: without the
-    identity, small exponents keep all their digits.
+    Taylor series of a sixteenth of A, then four squarings ``(I + E)^2 = I + (2 E + E^2)``; without the
+    identity, small exponents have no cancellation.
 
     References:
         Moler and Van Loan, "Nineteen dubious ways to compute the exponential of a matrix", 2003, method 3.
@@ -38,7 +38,7 @@ def exponential_less_identity(matrix: Float[Array, "k k"]) -> Float[Array, "k k"
 def logarithm(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
     """The principal logarithm of a matrix without eigenvalues on the negative real axis.
 
-    Three square roots by Denman and Beavers' iteration bring it near the identity, where
+    After three square roots by Denman and Beavers' iteration the matrix is near the identity, where
     ``log M = 2 artanh((M - I)(M + I)^-1)`` converges fast. The result is not finite for a singular matrix.
 
     References:

@@ -1,4 +1,4 @@
-"""Gray levels made comparable between images: exposure taken out before pixels are subtracted [K-22]."""
+"""Photometric normalization: invariance of gray levels to exposure [K-22]."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from jaxloc.images.gradients import convolve_columns, convolve_rows, pad_reflect
 
 
 class GainBias(eqx.Module):
-    """How one image's gray levels follow from another's: ``image = gain * reference + bias``.
+    """Photometric relation of two images, ``image = gain * reference + bias``.
 
     Attributes:
         gain: contrast, 1 where the reference is flat.
@@ -24,7 +24,7 @@ class GainBias(eqx.Module):
 
 
 def as_gray(image: Num[Array, "h w"] | Any, dtype: Any = None) -> Float[Array, "h w"]:
-    """Gray levels as floating numbers: bytes and other integers keep their values.
+    """Converts gray levels to floating point; integers keep their values.
 
     Example:
         >>> import jax.numpy as jnp
@@ -33,7 +33,7 @@ def as_gray(image: Num[Array, "h w"] | Any, dtype: Any = None) -> Float[Array, "
     """
     image = jnp.asarray(image)
     if image.ndim != 2:
-        raise ValueError(f"A gray image has two axes (rows, columns); got an array of shape {image.shape}.")
+        raise ValueError(f"A grayscale image has two axes (rows, columns); got an array of shape {image.shape}.")
     if dtype is None:
         dtype = image.dtype if jnp.issubdtype(image.dtype, jnp.floating) else jnp.result_type(float)
     return image.astype(dtype)
@@ -41,14 +41,14 @@ def as_gray(image: Num[Array, "h w"] | Any, dtype: Any = None) -> Float[Array, "
 
 @eqx.filter_jit
 def standardize(image: Float[Array, "h w"], *, valid: Bool[Array, "h w"] | None = None) -> Float[Array, "h w"]:
-    """Zero mean and unit variance over the valid pixels: the same for ``I`` and ``a I + b``, a > 0.
+    """Normalizes to zero mean and unit variance over the valid pixels: equal for ``I`` and ``a I + b``, a > 0.
 
     Args:
-        image: gray image.
-        valid: pixels that count; others, and pixels that are not finite, come out as zero.
+        image: grayscale image.
+        valid: pixels that are used; others, and non-finite ones, become zero.
 
     Returns:
-        ``(I - mean) / deviation``, zero all over for a flat image.
+        ``(I - mean) / deviation``, zero for a flat image.
 
     Example:
         >>> import jax.numpy as jnp
@@ -57,7 +57,7 @@ def standardize(image: Float[Array, "h w"], *, valid: Bool[Array, "h w"] | None 
     """
     valid, image = _usable(image, valid)
     centered, variance = _centered(image, valid)
-    # What rounding leaves of a flat image is no texture.
+    # Rounding errors of a flat image are no texture.
     level = jnp.max(jnp.abs(image))
     textured = variance > (4.0 * jnp.finfo(image.dtype).eps * level) ** 2
     return jnp.where(textured, centered / jnp.sqrt(jnp.where(textured, variance, 1.0)), 0.0)
@@ -65,12 +65,12 @@ def standardize(image: Float[Array, "h w"], *, valid: Bool[Array, "h w"] | None 
 
 @eqx.filter_jit
 def standardize_locally(image: Float[Array, "h w"], *, radius: int = 8, floor: float = 1.0) -> Float[Array, "h w"]:
-    """Zero mean and unit variance over a square around every pixel: what is left of shading and local contrast.
+    """Local normalization to zero mean and unit variance over a square around every pixel.
 
     Args:
-        image: gray image.
+        image: grayscale image.
         radius: half the side of the square, px.
-        floor: standard deviation of noise, gray levels, which keeps flat places from being blown up.
+        floor: standard deviation of noise, gray levels, which limits the gain in flat regions.
 
     Returns:
         ``(I - mean) / sqrt(variance + floor^2)``.
@@ -85,7 +85,7 @@ def standardize_locally(image: Float[Array, "h w"], *, radius: int = 8, floor: f
     def mean(values: Float[Array, "h w"]) -> Float[Array, "h w"]:
         return convolve_columns(convolve_rows(values, weights), weights)
 
-    # About the mean of the whole, so that squares of bright images keep their digits.
+    # Relative to the global mean, since squares of bright images are inaccurate.
     image = image - jnp.mean(image)
     local = mean(image)
     variance = jnp.maximum(mean(image * image) - local * local, 0.0)
@@ -99,9 +99,9 @@ def fit_gain_bias(
     """Least-squares gain and bias between two aligned images.
 
     Args:
-        image: gray image.
-        reference: image of the same place.
-        valid: pixels that count.
+        image: grayscale image.
+        reference: image of the same scene.
+        valid: pixels that are used.
 
     Returns:
         Gain and bias of ``image = gain * reference + bias``.
@@ -127,10 +127,10 @@ def fit_gain_bias(
 
 @eqx.filter_jit
 def rank_transform(image: Float[Array, "h w"], *, radius: int = 3) -> Float[Array, "h w"]:
-    """Share of the neighbors in a square that are darker than each pixel: no increasing map of gray levels changes it.
+    """Rank transform: fraction of darker neighbors in a square; invariant to increasing maps of gray levels.
 
     Args:
-        image: gray image; borders are reflected.
+        image: grayscale image; borders are reflected.
         radius: half the side of the square, px.
 
     Returns:

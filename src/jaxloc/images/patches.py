@@ -1,4 +1,4 @@
-"""Fixed-size patches around many subpixel centers: one slice and one constant shift a patch."""
+"""Extraction of fixed-size patches around many subpixel centers."""
 
 import equinox as eqx
 import jax
@@ -29,14 +29,14 @@ def extract(
     size: int | tuple[int, int],
     method: AbstractInterpolation | None = None,
 ) -> Patches:
-    """Cuts a patch around each point.
+    """Extracts a patch around each point.
 
-    All pixels of a patch lie the same fraction of a pixel off the grid, so that each patch is one contiguous slice that
-    is shifted once; that is an order of magnitude faster than sampling pixel by pixel. Pixel `[i, j]` of a patch is the
+    All pixels of a patch have the same subpixel offset, so that each patch is one contiguous slice that
+    is shifted once: an order of magnitude faster than sampling pixel by pixel. Pixel `[i, j]` of a patch is the
     image at `uv + (j - (q - 1) / 2, i - (p - 1) / 2)`; the values equal those of `interpolation.sample`.
 
     Args:
-        image: Gray image.
+        image: Grayscale image.
         uv: Patch centers, pixel coordinates (right, down).
         size: Static side of the patch in pixels, or (rows, columns); odd sizes have a pixel at their center.
         method: `Bilinear()` (the default) or `Bicubic()`.
@@ -65,7 +65,7 @@ def extract(
     base = jnp.floor(corner).astype(jnp.int32)
     fraction = (corner - base.astype(uv.dtype)).astype(image.dtype)
     extra = method.taps - 1
-    # Room for the neighbors of the outermost pixels, so that patches may touch the border.
+    # A margin for the neighbors of the outermost pixels, so that patches may touch the border.
     padded = jnp.pad(image, ((-method.first, extra + method.first),) * 2, mode="edge")
     windows = slice_windows(padded, base, (rows + extra, columns + extra))
     shifted = shift_windows(windows, fraction, method)
@@ -77,7 +77,7 @@ def slice_windows(
 ) -> Float[Array, "n p q"]:
     """Copies a window of `size = (rows, columns)` with its first pixel at each `corner = (column, row)`.
 
-    Windows that would leave the image are moved back into it, as `lax.dynamic_slice` does.
+    Windows that exceed the image are moved into it, as `lax.dynamic_slice` does.
 
     Example:
         >>> import jax.numpy as jnp
@@ -90,7 +90,7 @@ def slice_windows(
 def shift_windows(
     windows: Float[Array, "n p q"], fraction: Float[Array, "n 2"], method: AbstractInterpolation
 ) -> Float[Array, "n p2 q2"]:
-    """Shifts each window by its own constant fraction of a pixel; the result loses `taps - 1` rows and columns.
+    """Shifts each window by its own constant fraction of a pixel; the result has `taps - 1` fewer rows and columns.
 
     Example:
         >>> import jax.numpy as jnp

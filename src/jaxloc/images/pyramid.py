@@ -13,10 +13,10 @@ _BINOMIAL = (1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0)
 def halve(image: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
     """Smooths with the binomial kernel (1, 4, 6, 4, 1) / 16 and keeps every second row and column, as `cv2.pyrDown`.
 
-    The kept pixels are the even ones, so that the center of pixel `uv` lands on `uv / 2`.
+    The kept pixels are the even ones, so that pixel `uv` becomes `uv / 2`.
 
     Args:
-        image: Gray image.
+        image: Grayscale image.
 
     Returns:
         An image of `ceil(h / 2)` rows and `ceil(w / 2)` columns.
@@ -37,7 +37,7 @@ def gaussian_pyramid(image: Float[Array, "h w"], *, levels: int) -> tuple[Float[
     """Builds the image at full, half, quarter, ... size.
 
     Args:
-        image: Gray image.
+        image: Grayscale image.
         levels: Static number of levels, the full image included.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Spectra of images: a window against their borders, and amplitudes, which no shift changes [R-33, R-34]."""
+"""Image spectra: Hann window, amplitudes, and log-polar sampling [R-33, R-34]."""
 
 import math
 from typing import Any
@@ -11,7 +11,7 @@ from jaxloc.images.interpolation import Bilinear, sample
 
 
 def hann(shape: tuple[int, int], dtype: Any = float) -> Float[Array, "h w"]:
-    """The Hann window: one in the middle, zero half a pixel beyond the border.
+    """Hann window: one at the center, zero half a pixel beyond the border.
 
     Example:
         >>> hann((3, 3)).round(2)[1].tolist()
@@ -23,13 +23,13 @@ def hann(shape: tuple[int, int], dtype: Any = float) -> Float[Array, "h w"]:
 
 @eqx.filter_jit
 def amplitude(image: Float[Array, "h w"]) -> Float[Array, "h w"]:
-    """Size of the Fourier coefficients, ``|fft2(image)|``: the same for all circular shifts.
+    """Amplitude spectrum ``|fft2(image)|``, invariant to circular shifts.
 
     Args:
         image: gray levels.
 
     Returns:
-        Amplitudes in the order of `jnp.fft.fft2`, with finite derivatives also where they vanish.
+        Amplitudes in the order of `jnp.fft.fft2`, with finite derivatives at zeros.
 
     References:
         [R-33].
@@ -47,7 +47,7 @@ def amplitude(image: Float[Array, "h w"]) -> Float[Array, "h w"]:
 
 
 class LogPolar(eqx.Module):
-    """Sampling of an amplitude spectrum in logarithmic polar coordinates: rotation and scale become shifts.
+    """Sampling of an amplitude spectrum in logarithmic polar coordinates: rotation and scale become translations.
 
     Attributes:
         angles: static number of rows, over half a turn.
@@ -78,16 +78,16 @@ class LogPolar(eqx.Module):
         safe = jnp.log(1.0 + jnp.fft.fftshift(amplitudes) / jnp.maximum(jnp.mean(amplitudes), 1e-6))
         read = sample(safe, jnp.stack([u.reshape(-1), v.reshape(-1)], axis=1), method=Bilinear())
         values = read.values.reshape(self.angles, self.radii)
-        # Spectra of images fall off alike in all directions: only what departs from that tells rotation or scale.
+        # The mean decrease of spectra is isotropic: only deviations from it depend on rotation and scale.
         return values * (radius / self.highest)[None, :]
 
     def tapered(self, polar: Float[Array, "a r"]) -> Float[Array, "a r"]:
-        """Less its mean, and faded out to both ends of the radii; angles close upon themselves."""
+        """Zero mean, and tapered towards both ends of the radii; angles are periodic."""
         fade = jnp.sin(jnp.pi * (jnp.arange(self.radii, dtype=polar.dtype) + 0.5) / self.radii) ** 2
         return (polar - jnp.mean(polar, axis=0)[None, :]) * fade[None, :]
 
     def turn(self, shift: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Angle (right to down) and logarithm of scale of an image whose sampled spectrum moved by (radii, angles)."""
+        """Angle (right to down) and logarithm of scale of an image, from the shift (radii, angles) of its spectrum."""
         return shift[::-1] * self.steps(shift.dtype) * jnp.array([1.0, -1.0], dtype=shift.dtype)
 
     def steps(self, dtype: Any = float) -> Float[Array, "2"]:

@@ -1,6 +1,6 @@
-"""Warps of the image plane as matrix Lie groups: from a shift to a homography.
+"""Warps of the image plane as matrix Lie groups: translation, Euclidean, similarity, affine, homography.
 
-A warp W takes pixels of a template to pixels of an image, ``template(x) ~ image(W(x))``. Each class is a subgroup of
+A warp W maps pixels of a template to pixels of an image, ``template(x) ~ image(W(x))``. Each class is a subgroup of
 the next, and their generators are nested in one order, so that a tangent of a smaller group is the beginning of one of
 a larger group: shift right (px), shift down (px), rotation (u towards v, rad), scale (log), stretch of u against v,
 shear, and two perspective directions (1/px) [K-17, K-23].
@@ -19,7 +19,7 @@ from jaxloc.poses import SE2
 from jaxloc.poses.lie_group import Group
 
 _LABELS = ("right", "down", "rotation", "scale", "stretch", "shear", "perspective right", "perspective down")
-_FAR = -1e6  # where points at or beyond the horizon go: outside every image, px
+_FAR = -1e6  # coordinates of points at or beyond the horizon, outside every image, px
 
 
 class Warp(Group):
@@ -31,11 +31,11 @@ class Warp(Group):
     @staticmethod
     @abstractmethod
     def from_matrix(matrix: Float[Array, "3 3"]) -> Any:
-        """The warp of a homogeneous matrix; what the group lacks is dropped."""
+        """The warp of a homogeneous matrix; components outside the group are dropped."""
 
     @classmethod
     def of(cls, warp: "Warp") -> Any:
-        """The same warp as a member of this group; what the group lacks is dropped.
+        """The same warp as a member of this group; components outside the group are dropped.
 
         Example:
             >>> import jax.numpy as jnp
@@ -46,14 +46,14 @@ class Warp(Group):
 
     @classmethod
     def identity(cls, dtype: Any = float) -> Any:
-        """The warp that moves nothing."""
+        """The identity."""
         return cls.from_matrix(jnp.eye(3, dtype=dtype))
 
     @classmethod
     def exp(cls, delta: Float[Array, " d"]) -> Any:
         """The warp of a tangent, by the exponential of a 3x3 matrix."""
         generator = tangent_matrix(delta)
-        # Without its trace, the exponential has determinant one; a homography does not feel the difference.
+        # Without its trace, the exponential has determinant one; a homography is defined up to scale.
         shift = jnp.trace(generator) / 3.0 if cls.dof == 8 else jnp.zeros((), delta.dtype)
         eye = jnp.eye(3, dtype=delta.dtype)
         return cls.from_matrix(eye + exponential_less_identity(generator - shift * eye))
@@ -74,7 +74,7 @@ class Warp(Group):
         return jax.tree.leaves(self)[0].shape[: -2 if self.dof > 2 else -1]
 
     def compose(self, other: Any) -> Any:
-        """First the other warp, then this one; a product of two groups lies in the larger one."""
+        """The warp that applies the other one first; a product of two groups is in the larger one."""
         larger = type(self) if self.dof >= other.dof else type(other)
         return larger.from_matrix(matmul(self.matrix(), other.matrix()))
 
@@ -83,9 +83,9 @@ class Warp(Group):
         return self.compose(self.exp(delta))
 
     def inverse(self) -> Any:
-        """The warp back, from image to template; a warp that flattens the plane has none and gives numbers without use.
+        """Inverse warp, from image to template; meaningless numbers for a singular warp.
 
-        By the adjugate, scaled to keep the last entry of shifts, rotations and affine warps exactly one.
+        By the adjugate, scaled so that the last entry of translations, rotations and affine warps is exactly one.
         """
         (a, b, c), (d, e, f), (g, h, i) = self.matrix()
         rows = (
@@ -98,7 +98,7 @@ class Warp(Group):
         return self.from_matrix(adjugate / jnp.where(jnp.abs(scale) > 0, scale, 1.0))
 
     def log(self) -> Float[Array, " d"]:
-        """The tangent whose exponential this is; defined for warps that turn by less than half a circle."""
+        """Logarithm: the tangent whose exponential this is, for rotations of less than 180 degrees."""
         return _vee(logarithm(self.matrix()))[: self.dof]
 
     def adjoint(self) -> Float[Array, "d d"]:
@@ -112,7 +112,7 @@ class Warp(Group):
     def map_components(
         self, u: Float[Array, "*n"], v: Float[Array, "*n"]
     ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """Where pixels go, on component arrays of any shape; points at or beyond the horizon go far outside."""
+        """Mapped pixels, on component arrays of any shape; points at or beyond the horizon are mapped far outside."""
         (a, b, c), (d, e, f), (g, h, i) = self.matrix()
         right, down = a * u + b * v + c, d * u + e * v + f
         if self.dof < 8:
@@ -149,7 +149,7 @@ class Warp(Group):
 
 
 class Translation(Warp):
-    """A shift ``x + t`` [K-23].
+    """Translation ``x + t`` [K-23].
 
     Attributes:
         translation: (right, down), px.
@@ -167,16 +167,16 @@ class Translation(Warp):
 
     @staticmethod
     def from_matrix(matrix: Float[Array, "3 3"]) -> "Translation":
-        """The shift of a homogeneous matrix."""
+        """The translation of a homogeneous matrix."""
         return Translation(matrix[:2, 2])
 
     @classmethod
     def exp(cls, delta: Float[Array, "2"]) -> "Translation":
-        """The shift itself."""
+        """The translation itself."""
         return Translation(delta)
 
     def log(self) -> Float[Array, "2"]:
-        """The shift itself."""
+        """The translation itself."""
         return self.translation
 
     def matrix(self) -> Float[Array, "3 3"]:
@@ -185,7 +185,7 @@ class Translation(Warp):
 
 
 class Euclidean(Warp):
-    """A rotation and a shift: `poses.SE2` on pixels.
+    """Rotation and translation: `poses.SE2` on pixels.
 
     Example:
         >>> import jax.numpy as jnp
@@ -201,7 +201,7 @@ class Euclidean(Warp):
 
     @staticmethod
     def from_matrix(matrix: Float[Array, "3 3"]) -> "Euclidean":
-        """The rotation nearest to a matrix, and its shift."""
+        """The rotation nearest to a matrix, and its translation."""
         cos, sin = matrix[0, 0] + matrix[1, 1], matrix[1, 0] - matrix[0, 1]
         squared = cos * cos + sin * sin
         turns = squared > 0
@@ -223,21 +223,21 @@ class Euclidean(Warp):
         return self.homogeneous
 
     def add(self, delta: Float[Array, "3"]) -> "Euclidean":
-        """Angle and shift added."""
+        """Sum of angles and translations."""
         turned = matmul(self.homogeneous, SE2.exp(delta.at[:2].set(0.0)).matrix())
         return Euclidean.from_matrix(turned.at[:2, 2].add(delta[:2]))
 
     def additive_jacobian_components(
         self, u: Float[Array, "*n"], v: Float[Array, "*n"]
     ) -> tuple[Float[Array, "3 *n"], Float[Array, "3 *n"]]:
-        """Derivative by shift and angle: the angle turns the rotated point."""
+        """Derivative by translation and angle."""
         one, zero = jnp.ones_like(u), jnp.zeros_like(u)
         (a, b, _), (d, e, _), _ = self.homogeneous
         return jnp.stack([one, zero, -a * v + b * u]), jnp.stack([zero, one, -d * v + e * u])
 
 
 class Similarity(Warp):
-    """A rotation, a change of scale and a shift."""
+    """Rotation, scale and translation."""
 
     homogeneous: Float[Array, "3 3"]
 
@@ -246,7 +246,7 @@ class Similarity(Warp):
 
     @staticmethod
     def from_matrix(matrix: Float[Array, "3 3"]) -> "Similarity":
-        """The scaled rotation nearest to a matrix, and its shift."""
+        """The scaled rotation nearest to a matrix, and its translation."""
         cos, sin = 0.5 * (matrix[0, 0] + matrix[1, 1]), 0.5 * (matrix[1, 0] - matrix[0, 1])
         return Similarity(_similar(cos, sin, matrix[:2, 2]))
 
@@ -256,7 +256,7 @@ class Similarity(Warp):
 
 
 class Affine(Warp):
-    """Any linear map and a shift: parallels stay parallel."""
+    """Linear map and translation; parallel lines stay parallel."""
 
     homogeneous: Float[Array, "3 3"]
 
@@ -275,7 +275,7 @@ class Affine(Warp):
 
 
 class Homography(Warp):
-    """A map of the projective plane: how a plane of the world appears in two images. SL(3), determinant one.
+    """Homography, the map between two images of a plane; SL(3), determinant one.
 
     References:
         Benhimane and Malis, "Homography-based 2D visual tracking and servoing", 2007, for the group.
@@ -294,7 +294,7 @@ class Homography(Warp):
 
     @staticmethod
     def from_matrix(matrix: Float[Array, "3 3"]) -> "Homography":
-        """The homography of any multiple of its matrix; one that flattens the plane is kept as it is."""
+        """The homography of any multiple of its matrix; a singular one is unchanged."""
         determinant = jnp.sum(matrix[0] * jnp.cross(matrix[1], matrix[2]))
         regular = jnp.abs(determinant) > 0
         return Homography(matrix / jnp.where(regular, jnp.cbrt(jnp.where(regular, determinant, 1.0)), 1.0))

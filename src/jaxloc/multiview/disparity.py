@@ -1,4 +1,4 @@
-"""Dense stereo: a disparity for every pixel of a rectified pair, by windows in JAX or by OpenCV, and to subpixels."""
+"""Dense stereo matching of a rectified pair: block matching in JAX, semi-global matching by OpenCV, refinement."""
 
 from abc import abstractmethod
 from typing import Any
@@ -12,17 +12,17 @@ from jaxtyping import Array, Bool, Float, Num
 from jaxloc.features import subpixel
 from jaxloc.features.opencv import backend
 
-# Cost where a window leaves the other image.
+# Cost of windows outside the other image.
 _OUTSIDE = 1e9
 
 
 class DisparityMap(eqx.Module):
-    """Columns by which points of the left image lie further left in the right one.
+    """Disparities ``u_left - u_right`` of the pixels of the left image.
 
     Attributes:
         disparity: px; zero where not valid.
-        variance: px^2; one where not valid. It knows the noise of the pixels, not wrong matches; that of matched blocks
-            is right within a factor of three, that of `refine` is the better one.
+        variance: px^2; one where not valid. It accounts for pixel noise, not for wrong matches; that of block matching
+            is right within a factor of three, that of `refine` is more accurate.
         valid: pixels with a disparity.
     """
 
@@ -32,11 +32,11 @@ class DisparityMap(eqx.Module):
 
 
 class WindowCost(eqx.Module):
-    """How unlike two windows are."""
+    """Matching cost of two windows."""
 
     @abstractmethod
     def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
-        """What is needed of an image, once: arrays "... h w"."""
+        """Arrays "... h w" that are computed once an image."""
 
     @abstractmethod
     def compare(self, left: Any, right: Any, size: int) -> Float[Array, "h w"]:
@@ -57,7 +57,7 @@ class SSD(WindowCost):
 
 
 class ZNCC(WindowCost):
-    """One minus the normalized correlation: blind to gain and bias of a window [R-44].
+    """One minus the zero-mean normalized correlation: invariant to gain and bias of a window [R-44].
 
     Attributes:
         least_contrast: standard deviation below which a window has no texture, gray levels.
@@ -66,12 +66,12 @@ class ZNCC(WindowCost):
     least_contrast: float = eqx.field(static=True, default=1.0)
 
     def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
-        """The image about its mean, with the mean and the inverse deviation of each window."""
+        """The centered image, with mean and inverse standard deviation of each window."""
         centered = image - jnp.mean(image)
         mean = box_mean(centered, size)
-        spread = box_mean(centered**2, size) - mean**2
-        textured = spread > self.least_contrast**2
-        return jnp.stack([centered, mean, jnp.where(textured, lax.rsqrt(jnp.where(textured, spread, 1.0)), 0.0)])
+        variance = box_mean(centered**2, size) - mean**2
+        textured = variance > self.least_contrast**2
+        return jnp.stack([centered, mean, jnp.where(textured, lax.rsqrt(jnp.where(textured, variance, 1.0)), 0.0)])
 
     def compare(self, left: Any, right: Any, size: int) -> Float[Array, "h w"]:
         """Between 0 and 2."""
@@ -80,10 +80,10 @@ class ZNCC(WindowCost):
 
 
 class Census(WindowCost):
-    """Mean number of pixels whose order against the middle one differs, over the window; without derivatives.
+    """Census transform: Hamming distance of comparisons with the center pixel; without derivatives.
 
     Attributes:
-        radius: half sides (rows, columns) of the neighborhood whose order counts.
+        radius: half sides (rows, columns) of the compared neighborhood.
 
     References:
         Zabih and Woodfill, "Non-parametric local transforms for computing visual correspondence", ECCV 1994.
@@ -92,7 +92,7 @@ class Census(WindowCost):
     radius: tuple[int, int] = eqx.field(static=True, default=(3, 4))
 
     def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
-        """Bits of the neighbors that are darker than the middle, 31 a word."""
+        """Comparisons of the neighbors with the center pixel, 31 bits an integer."""
         del size
         rows, columns = self.radius
         height, width = image.shape
@@ -103,11 +103,11 @@ class Census(WindowCost):
             for j in range(2 * columns + 1)
             if (i, j) != self.radius
         ]
-        words = [bits[start : start + 31] for start in range(0, len(bits), 31)]
-        return jnp.stack([sum(bit.astype(jnp.int32) << k for k, bit in enumerate(word)) for word in words])
+        groups = [bits[start : start + 31] for start in range(0, len(bits), 31)]
+        return jnp.stack([sum(bit.astype(jnp.int32) << k for k, bit in enumerate(group)) for group in groups])
 
     def compare(self, left: Any, right: Any, size: int) -> Float[Array, "h w"]:
-        """Bits that differ, as a share of all."""
+        """Fraction of bits that differ."""
         rows, columns = self.radius
         count = (2 * rows + 1) * (2 * columns + 1) - 1
         differ = jnp.sum(lax.population_count(jnp.bitwise_xor(left, right)), axis=0)
@@ -129,7 +129,7 @@ def box_mean(image: Float[Array, "h w"], size: int) -> Float[Array, "h w"]:
 
 
 class Matcher(eqx.Module):
-    """How a rectified pair is matched."""
+    """Matcher of a rectified pair."""
 
     @abstractmethod
     def match(self, left: Num[Any, "h w"], right: Num[Any, "h w"]) -> DisparityMap:
@@ -137,14 +137,14 @@ class Matcher(eqx.Module):
 
 
 class BlockMatching(Matcher):
-    """The best window of a row, in JAX: for batches, accelerators and derivatives.
+    """Block matching in JAX, for batches, accelerators and derivatives.
 
     Attributes:
-        cost: how windows are compared.
+        cost: matching cost.
         size: odd side of a window, px.
-        num_disparities: disparities that are tried, from zero.
-        uniqueness: part by which every other disparity has to be dearer, its two neighbors excepted.
-        consistency: greatest difference of the disparities found from the left and from the right, px.
+        num_disparities: number of disparities, from zero.
+        uniqueness: least relative excess of the cost of all other disparities but the two neighbors.
+        consistency: greatest difference between left-to-right and right-to-left disparities, px.
     """
 
     cost: WindowCost = Census()
@@ -154,16 +154,16 @@ class BlockMatching(Matcher):
     consistency: float = eqx.field(static=True, default=1.0)
 
     def match(self, left: Num[Any, "h w"], right: Num[Any, "h w"]) -> DisparityMap:
-        """Lowest cost, a parabola through its neighbors, and the check from the other side."""
+        """Lowest cost, a parabola through its neighbors, and the left-right consistency check."""
         dtype = left.dtype if jnp.issubdtype(left.dtype, jnp.floating) else jnp.float32
         return _match_blocks(jnp.asarray(left, dtype), jnp.asarray(right, dtype), self)
 
 
 class SemiGlobal(Matcher):
-    """OpenCV's semi-global matcher, on the host: the fast path. In sixteenths of a pixel; `refine` removes the steps.
+    """OpenCV's semi-global matcher, on the host; fast, quantized to 1/16 px, which `refine` removes.
 
     Attributes:
-        num_disparities: disparities that are tried, a multiple of 16.
+        num_disparities: number of disparities, a multiple of 16.
         size: odd side of a window, px.
         uniqueness: margin of the best cost over the second, percent.
         consistency: greatest difference between left and right, px; -1 for none.
@@ -209,18 +209,18 @@ def match(
     *,
     matcher: Matcher = SemiGlobal(),  # noqa: B008 (an immutable record)
 ) -> DisparityMap:
-    """The disparity of each pixel of the left image of a rectified pair.
+    """Disparity of each pixel of the left image of a rectified pair.
 
     Args:
         left: left image, gray levels.
         right: right image.
-        matcher: `SemiGlobal()` is OpenCV's, on the host; `BlockMatching()` is traced: `jit`, `vmap` and `grad` it.
+        matcher: `SemiGlobal()` is OpenCV's, on the host; `BlockMatching()` works under `jit`, `vmap` and `grad`.
 
     Returns:
         Disparities, their variance, and where they are valid.
 
     Raises:
-        ValueError: the images have not the same shape.
+        ValueError: the images have different shapes.
 
     References:
         Review section 5.1 [R-44]; thesis section 2.1 [T-7].
@@ -250,14 +250,14 @@ def _match_blocks(left: Array, right: Array, options: BlockMatching) -> Disparit
         jnp.take_along_axis(costs, jnp.clip(best + step, 0, last)[None], axis=0)[0] for step in (0, -1, 1)
     )
     inner = (best > 0) & (best < last) & (before < _OUTSIDE) & (after < _OUTSIDE)
-    bend = jnp.where(inner, before - 2.0 * lowest + after, 0.0)
-    bent = bend > 1e-6
-    safe = jnp.where(bent, bend, 1.0)
-    disparity = best.astype(left.dtype) + jnp.where(bent, 0.5 * (before - after) / safe, 0.0)
-    valid = inner & bent & _inside(left.shape, options.size)
-    valid &= _is_unique(costs, best, lowest, options.uniqueness) & _agrees(costs, best, options.consistency)
+    curvature = jnp.where(inner, before - 2.0 * lowest + after, 0.0)
+    curved = curvature > 1e-6
+    safe = jnp.where(curved, curvature, 1.0)
+    disparity = best.astype(left.dtype) + jnp.where(curved, 0.5 * (before - after) / safe, 0.0)
+    valid = inner & curved & _inside(left.shape, options.size)
+    valid &= _is_unique(costs, best, lowest, options.uniqueness) & _is_consistent(costs, best, options.consistency)
     valid &= box_mean(finite.astype(left.dtype), options.size) > 0.999
-    # What is left of the cost is noise, its curvature the texture: 2 c / (n c''), as for sums of squares.
+    # The lowest cost is due to noise, its curvature to texture: 2 c / (n c''), as for sums of squares.
     variance = 2.0 * jnp.maximum(lowest, 0.0) / (options.size**2 * safe)
     return DisparityMap(jnp.where(valid, disparity, 0.0), jnp.where(valid, variance, 1.0), valid)
 
@@ -284,38 +284,38 @@ def _inside(shape: tuple[int, ...], size: int) -> Bool[Array, "h w"]:
 
 
 def _is_unique(costs: Array, best: Array, lowest: Array, margin: float) -> Bool[Array, "h w"]:
-    """Whether no disparity but the best and its neighbors is nearly as cheap."""
+    """Whether all disparities but the best and its neighbors cost clearly more."""
 
-    def rival(d: Any, least: Array) -> Array:
+    def least_other(d: Any, least: Array) -> Array:
         return jnp.where(jnp.abs(best - d) <= 1, least, jnp.minimum(least, costs[d]))
 
-    rest = lax.stop_gradient(lax.fori_loop(0, costs.shape[0], rival, jnp.full_like(lowest, _OUTSIDE)))
+    rest = lax.stop_gradient(lax.fori_loop(0, costs.shape[0], least_other, jnp.full_like(lowest, _OUTSIDE)))
     return rest > (1.0 + margin) * lowest
 
 
-def _agrees(costs: Array, best: Array, tolerance: float) -> Bool[Array, "h w"]:
-    """Whether the right image's pixel finds its way back."""
+def _is_consistent(costs: Array, best: Array, tolerance: float) -> Bool[Array, "h w"]:
+    """Left-right consistency: whether the right image's pixel is matched to the same disparity."""
     span, height, width = costs.shape
 
-    def back(d: Any, carried: tuple[Array, Array]) -> tuple[Array, Array]:
-        least, chosen = carried
+    def from_right(d: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        least, chosen = state
         padded = jnp.pad(costs[d], ((0, 0), (0, span)), constant_values=_OUTSIDE)
         cost = lax.dynamic_slice_in_dim(padded, d, width, axis=1)
         return jnp.minimum(cost, least), jnp.where(cost < least, d, chosen)
 
-    start = jnp.full((height, width), 2.0 * _OUTSIDE, costs.dtype), jnp.zeros((height, width), best.dtype)
-    _, chosen = lax.stop_gradient(lax.fori_loop(0, span, back, start))
+    initial = jnp.full((height, width), 2.0 * _OUTSIDE, costs.dtype), jnp.zeros((height, width), best.dtype)
+    _, chosen = lax.stop_gradient(lax.fori_loop(0, span, from_right, initial))
     partner = jnp.clip(jnp.arange(width)[None, :] - best, 0, width - 1)
-    apart = jnp.abs(jnp.take_along_axis(chosen, partner, axis=1) - best)
-    return apart.astype(costs.dtype) <= tolerance
+    difference = jnp.abs(jnp.take_along_axis(chosen, partner, axis=1) - best)
+    return difference.astype(costs.dtype) <= tolerance
 
 
 class DenseRefinement(eqx.Module):
-    """How disparities are refined.
+    """Options of the refinement of disparities.
 
     Attributes:
-        patches: window, reach and trust.
-        most: greatest correction that is believed, px: more is another surface.
+        patches: window, reach and thresholds.
+        most: greatest accepted correction, px; larger ones belong to another surface.
     """
 
     patches: subpixel.PatchRefinement = subpixel.PatchRefinement(size=7, reach=1, num_steps=3, min_correlation=0.7)
@@ -330,28 +330,28 @@ def refine(
     *,
     options: DenseRefinement = DenseRefinement(),  # noqa: B008 (an immutable record)
 ) -> DisparityMap:
-    """Refines disparities to subpixels, with gain and bias of every window free: the steps of 1/16 px vanish.
+    """Subpixel refinement of disparities, with gain and bias of every window.
 
     Args:
         left: left image, gray levels.
         right: right image.
         found: disparities within a pixel of the truth.
-        options: window, trust, and the greatest correction.
+        options: window, thresholds and greatest correction.
 
     Returns:
-        The map with the refined disparities and their variance where the refinement is to be trusted, and as it was
+        The map with refined disparities and their variance where the refinement is valid, and unchanged values
         elsewhere. Gradients are those of the minimum.
 
     References:
-        `images.subpixel.refine_stereo` [T-10].
+        `features.subpixel.refine_stereo` [T-10].
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> u, v = jnp.meshgrid(jnp.arange(60.0), jnp.arange(20.0))
         >>> scene = lambda u: 100 + 50 * jnp.sin(0.5 * u) * jnp.cos(0.4 * v)
         >>> whole = jnp.full((20, 60), 4.0)
-        >>> guess = jl.multiview.disparity.DisparityMap(whole, jnp.ones_like(whole), whole > 0)
-        >>> found = jl.multiview.disparity.refine(scene(u), 0.8 * scene(u + 4.3) + 9, guess)
+        >>> rough = jl.multiview.disparity.DisparityMap(whole, jnp.ones_like(whole), whole > 0)
+        >>> found = jl.multiview.disparity.refine(scene(u), 0.8 * scene(u + 4.3) + 9, rough)
         >>> round(float(found.disparity[10, 30]), 1)
         4.3
     """
@@ -360,7 +360,7 @@ def refine(
     columns = jnp.arange(width, dtype=left.dtype)
     disparity = found.disparity.astype(left.dtype)
 
-    def row(item: tuple[Array, Array]) -> subpixel.RefinedColumns:
+    def row(item: tuple[Array, Array]) -> subpixel.RefinedPoints:
         index, shifts = item
         rows = jnp.full_like(columns, index)
         uv_left, uv_right = jnp.stack([columns, rows], axis=1), jnp.stack([columns - shifts, rows], axis=1)

@@ -1,6 +1,6 @@
-"""What two views say of each other: essential and fundamental matrices, lines, epipoles and errors.
+"""Epipolar geometry of two views: essential and fundamental matrices, epipolar lines, epipoles and distances.
 
-The convention throughout: ``x1^T M x2 = 0`` for a point seen at ``x1`` by the first camera and at ``x2`` by the second.
+Convention: ``x1^T M x2 = 0`` for a point seen at ``x1`` by the first camera and at ``x2`` by the second.
 With ``T_first_second = (R, t)``, the essential matrix is ``E = [t] R`` (OpenCV's and PoseLib's are its transpose), and
 ``F = K1^-T E K2^-1``.
 """
@@ -19,9 +19,9 @@ from jaxloc.solvers import Problem, Quadratic
 
 
 class RelativePose(eqx.Module):
-    """The pose of a second camera in the frame of the first, but for the length of the translation.
+    """Pose of a second camera in the frame of the first, up to the length of the translation.
 
-    A state of five degrees of freedom: the essential matrix stays on its manifold, whatever step is taken.
+    The state has five degrees of freedom; steps in its tangent space keep the essential matrix on its manifold.
 
     Attributes:
         direction: of the translation, frame of the first camera.
@@ -33,7 +33,7 @@ class RelativePose(eqx.Module):
 
     @staticmethod
     def of(pose: SE3) -> "RelativePose":
-        """A pose without the length of its translation."""
+        """The rotation and direction of translation of a pose."""
         return RelativePose(Direction.from_vector(pose.translation), pose.rotation)
 
     def essential(self) -> Float[Array, "3 3"]:
@@ -41,12 +41,12 @@ class RelativePose(eqx.Module):
         return matmul(skew(self.direction.vector), self.rotation.matrix())
 
     def pose(self, length: Any = 1.0) -> SE3:
-        """``T_first_second`` with a translation of a length, m."""
+        """``T_first_second`` with a translation of the given length, m."""
         return SE3(self.rotation, self.direction.vector * length)
 
 
 def fundamental(essential: Float[Array, "3 3"], first: Pinhole, second: Pinhole) -> Float[Array, "3 3"]:
-    """``F = K1^-T E K2^-1``, for pixels without lens, of unit Frobenius norm.
+    """``F = K1^-T E K2^-1``, for undistorted pixels, of unit Frobenius norm.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -62,7 +62,7 @@ def fundamental(essential: Float[Array, "3 3"], first: Pinhole, second: Pinhole)
 
 
 def homogeneous(points: Float[Array, "n 2"]) -> Float[Array, "3 n"]:
-    """Points with a third coordinate of one, along the last axis."""
+    """Homogeneous coordinates, points along the last axis."""
     return jnp.concatenate([points.T, jnp.ones_like(points.T[:1])])
 
 
@@ -88,7 +88,7 @@ def epipolar_lines(matrix: Float[Array, "3 3"], second: Float[Array, "n 2"]) -> 
 
 @eqx.filter_jit
 def epipoles(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Where each camera appears in the other's image: unit homogeneous points with ``e1^T M = 0``, ``M e2 = 0``.
+    """Images of each camera's center in the other view: unit homogeneous points with ``e1^T M = 0``, ``M e2 = 0``.
 
     Args:
         matrix: fundamental or essential, of rank two.
@@ -109,7 +109,7 @@ def epipoles(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Arra
 
 
 def null_vector(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
-    """Unit vector at right angles to the rows of a matrix of rank two, and whether its rank is two at least.
+    """Unit vector orthogonal to the rows of a matrix of rank two, and whether its rank is at least two.
 
     The largest of the rows' cross products, of a matrix of any scale; the third axis for a lower rank.
     """
@@ -125,30 +125,30 @@ def null_vector(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Bool[Ar
 
 
 def unit_rays(rays: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Rays of length one; zero where numbers are not finite."""
+    """Rays normalized to length one; zero where not finite."""
     rays = jnp.where(jnp.all(jnp.isfinite(rays), axis=1, keepdims=True), rays, 0.0)
     squared = jnp.sum(rays * rays, axis=1, keepdims=True)
     return rays / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
 
 
 def depth_signs(
-    direction: Float[Array, "3"], first: Float[Array, "n 3"], turned: Float[Array, "n 3"]
+    direction: Float[Array, "3"], first: Float[Array, "n 3"], second: Float[Array, "n 3"]
 ) -> Float[Array, "2 n"]:
-    """Whose sign tells whether the point where two rays come nearest lies ahead (+) along each of them.
+    """Numbers with the signs of the depths of the point nearest to both rays, along each of them.
 
     Args:
         direction: of the translation, frame of the first camera.
         first: rays of the first camera, of any length.
-        turned: rays of the second, in the frame of the first.
+        second: rays of the second, rotated into the frame of the first.
     """
-    normal, shift = jnp.cross(first, turned), jnp.broadcast_to(direction, first.shape)
-    return jnp.stack([jnp.sum(jnp.cross(shift, other) * normal, axis=1) for other in (turned, first)])
+    normal, shift = jnp.cross(first, second), jnp.broadcast_to(direction, first.shape)
+    return jnp.stack([jnp.sum(jnp.cross(shift, other) * normal, axis=1) for other in (second, first)])
 
 
 def coplanarity(
     matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "n 2"]
 ) -> Float[Array, " n"]:
-    """``x1^T M x2``: the volume that both rays and the baseline span; zero for rays that meet.
+    """Epipolar constraint ``x1^T M x2``: volume spanned by both rays and the baseline; zero for rays that intersect.
 
     References:
         Longuet-Higgins 1981; review eq. 19, ``(P_l - T) . T x P_l = 0`` [R-47].
@@ -175,12 +175,12 @@ def sampson_components(matrix: Array, x1: Float[Array, "3 n"], x2: Float[Array, 
 def sampson_distance(
     matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "n 2"]
 ) -> Float[Array, " n"]:
-    """How far a pair of points has to move, to first order, until its rays meet; signed, in the points' unit.
+    """Sampson distance: first-order geometric distance of pairs from the epipolar constraint, signed, in their unit.
 
     Args:
         matrix: fundamental (points in px) or essential (normalized coordinates).
         first: points of the first image.
-        second: their partners.
+        second: the corresponding points.
 
     References:
         Sampson 1982; Hartley and Zisserman, *Multiple View Geometry*, 2004, eq. 11.9 [R-48].
@@ -189,7 +189,7 @@ def sampson_distance(
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> sideways = jl.poses.lie_group.skew(jnp.array([1.0, 0.0, 0.0]))
         >>> off = jl.multiview.epipolar.sampson_distance(sideways, jnp.array([[2.0, 3.0]]), jnp.array([[5.0, 4.0]]))
-        >>> round(abs(float(off[0])), 3)  # half a pixel each: sqrt(1/2) for both
+        >>> round(abs(float(off[0])), 3)  # half a pixel each: sqrt(1/2) in all
         0.707
     """
     return sampson_components(matrix, homogeneous(first), homogeneous(second))
@@ -212,8 +212,8 @@ def symmetric_distance(
         1.414
     """
     lines = epipolar_lines(matrix, second), epipolar_lines(matrix.T, first)
-    apart = [jnp.sum(homogeneous(p) * line.T, axis=0) for p, line in zip((first, second), lines, strict=True)]
-    squared = apart[0] ** 2 + apart[1] ** 2
+    distances = [jnp.sum(homogeneous(p) * line.T, axis=0) for p, line in zip((first, second), lines, strict=True)]
+    squared = distances[0] ** 2 + distances[1] ** 2
     some = squared > 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, squared, 1.0)), 0.0)
 
@@ -222,7 +222,7 @@ def symmetric_distance(
 def epipolar_gate(
     matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "m 2"], *, band: Any = 2.0
 ) -> Bool[Array, "n m"]:
-    """Candidates near each other's epipolar lines: what `images.match.match` takes as its gate.
+    """Pairs near each other's epipolar lines: a `gate` of `features.match.match`.
 
     Args:
         matrix: fundamental matrix.
@@ -231,7 +231,7 @@ def epipolar_gate(
         band: greatest Sampson distance, px.
 
     Returns:
-        Which pairs may belong together: a search along a line instead of over the image [R-46].
+        True where the pair may match: the search is along a line instead of over the image [R-46].
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -248,13 +248,13 @@ def epipolar_gate(
 
 
 class EpipolarError(Problem):
-    """Corresponding rays of two calibrated views; the state is the `RelativePose`.
+    """Least-squares problem of corresponding rays of two calibrated views; the state is the `RelativePose`.
 
     Attributes:
         first: "3 n", homogeneous normalized points of the first view; finite everywhere.
         second: "3 n", of the second.
         sigma: standard deviation of a coordinate, normalized: px over focal length.
-        valid: which count.
+        valid: pairs that are used.
         loss: robust kernel.
     """
 

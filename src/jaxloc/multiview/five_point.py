@@ -1,8 +1,8 @@
-"""Relative poses from five points: the minimal solver of two calibrated views.
+"""Five-point algorithm: relative poses of two calibrated views from five correspondences.
 
 The essential matrix lies in a space of four dimensions, ``E = x X + y Y + z Z + W``. Ten cubic equations in x, y, z
-make it one; eliminating x and y leaves a polynomial of degree ten in z. All its roots are found together, without the
-eigenvalues of a companion matrix, which accelerators lack; Newton steps on the manifold polish what is real.
+constrain them; eliminating x and y leaves a polynomial of degree ten in z. All its roots are found at once, without the
+eigenvalues of a companion matrix, which accelerators lack; Newton steps on the manifold refine the real solutions.
 """
 
 import itertools
@@ -31,10 +31,10 @@ _QUADRATIC = ["".join(pair) for pair in itertools.combinations_with_replacement(
 
 
 def _product_table(left: list[str], result: list[str]) -> np.ndarray:
-    """One where a monomial times a letter gives another."""
+    """Table of products of monomials: one where a monomial times a letter is the result."""
     rank = {letter: place for place, letter in enumerate(_LETTERS)}
-    normal = lambda word: "".join(sorted(word, key=rank.__getitem__))  # noqa: E731
-    names = [normal(word) for word in result]
+    normal = lambda letters: "".join(sorted(letters, key=rank.__getitem__))  # noqa: E731
+    names = [normal(name) for name in result]
     table = np.zeros((len(result), len(left), 4))
     for i, j in itertools.product(range(len(left)), range(4)):
         table[names.index(normal(left[i] + _LETTERS[j])), i, j] = 1.0
@@ -46,11 +46,11 @@ _CUBES = _product_table(_QUADRATIC, _CUBIC)
 
 
 class RelativePoses(NamedTuple):
-    """The candidates of a minimal solver.
+    """Solutions of a minimal solver.
 
     Attributes:
-        poses: stacked.
-        valid: which of them are solutions.
+        poses: a stack.
+        valid: entries that are solutions.
     """
 
     poses: RelativePose
@@ -66,8 +66,8 @@ def five_point(first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> Relat
         second: rays to the same points, second view.
 
     Returns:
-        Ten candidates, each the one of four poses of its essential matrix that has most of the five points ahead of
-        both cameras; `valid` marks solutions. Without derivatives; everything stays finite.
+        Ten candidates, each the one of four poses of its essential matrix with most of the five points in front of
+        both cameras; `valid` marks solutions. Without derivatives; all values are finite.
 
     References:
         Nister, "An efficient solution to the five-point relative pose problem", T-PAMI 2004; Stewenius, Engels, Nister,
@@ -86,17 +86,17 @@ def five_point(first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> Relat
     essentials, real = essential_candidates(first[None], second[None])
 
     def candidate(essential: Array, real: Array) -> tuple[RelativePose, Array]:
-        pose = polished(facing(decompose(essential), first, second), first, second)
+        pose = polish(facing(decompose(essential), first, second), first, second)
         return pose, real & _explains(pose, first, second)
 
     poses, valid = jax.vmap(candidate)(essentials[:, 0], real[:, 0])
-    return RelativePoses(poses, valid & _once(poses, valid))
+    return RelativePoses(poses, valid & _is_first(poses, valid))
 
 
 def essential_candidates(
     first: Float[Array, "h 5 3"], second: Float[Array, "h 5 3"]
 ) -> tuple[Float[Array, "10 h 3 3"], Bool[Array, "10 h"]]:
-    """Essential matrices of many samples, as exact as rounding leaves them, and which are solutions.
+    """Essential matrices of many samples, up to rounding errors, and which are solutions.
 
     Samples lie along the last axis of the inner loops.
 
@@ -105,7 +105,7 @@ def essential_candidates(
         second: rays of the second view.
 
     Returns:
-        Ten matrices a sample, finite; in float32 to some digits, which `polished` mends.
+        Ten matrices a sample, finite; in float32 of a few digits, which `polish` corrects.
     """
     basis, spans = jax.vmap(_null_space)(first, second)
     rest, regular = jax.vmap(_eliminated)(basis)
@@ -183,7 +183,7 @@ def _determinant(lines: list[list[_Polynomial]]) -> Float[Array, "11 h"]:
 
 
 def _null_vectors(lines: list[list[_Polynomial]], roots: Float[Array, "10 h"]) -> tuple[Array, Array, Array]:
-    """What the three equations vanish for at each root: the largest cross product of two, of unit length."""
+    """Null vector (x, y, w) of the three equations at each root: the largest cross product of two, normalized."""
 
     def at(polynomial: _Polynomial) -> Array:
         value = jnp.broadcast_to(polynomial[-1], roots.shape)
@@ -208,7 +208,7 @@ def _null_vectors(lines: list[list[_Polynomial]], roots: Float[Array, "10 h"]) -
 def _real_roots(polynomials: Float[Array, "11 h"]) -> tuple[Float[Array, "10 h"], Bool[Array, "10 h"]]:
     """Roots of polynomials, lowest power first, all at once by Aberth's method, and which are real.
 
-    Pairs of real arrays: complex division is slow.
+    Complex numbers are pairs of real arrays, since complex division is slow.
     """
     dtype, tiny = polynomials.dtype, float(jnp.finfo(polynomials.dtype).eps)
     largest = jnp.max(jnp.abs(polynomials), axis=0)
@@ -216,10 +216,10 @@ def _real_roots(polynomials: Float[Array, "11 h"]) -> tuple[Float[Array, "10 h"]
     c = jnp.where(known[None], polynomials, 1.0) / jnp.where(known, largest, 1.0)[None]
     floor = tiny**2
     c = c.at[-1].set(jnp.where(jnp.abs(c[-1]) > floor, c[-1], floor))
-    # About a circle as large as the geometric mean of the roots; no start is real.
+    # Initial values near a circle with the geometric mean of the roots as radius; none is real.
     radius = jnp.clip((jnp.maximum(jnp.abs(c[0]), floor) / jnp.abs(c[-1])) ** 0.1, 1e-3, 1e3)
-    angle, spread = 2.0 * np.pi * np.arange(10) / 10 + 0.3, 0.6 + 0.1 * np.arange(10)
-    start = [jnp.asarray(spread * f(angle), dtype)[:, None] * radius[None] for f in (np.cos, np.sin)]
+    angle, scale = 2.0 * np.pi * np.arange(10) / 10 + 0.3, 0.6 + 0.1 * np.arange(10)
+    initial = [jnp.asarray(scale * f(angle), dtype)[:, None] * radius[None] for f in (np.cos, np.sin)]
 
     def step(_: Any, roots: tuple[Array, Array]) -> tuple[Array, Array]:
         re, im = roots
@@ -229,16 +229,19 @@ def _real_roots(polynomials: Float[Array, "11 h"]) -> tuple[Float[Array, "10 h"]
             slope = slope[0] * re - slope[1] * im + value[0], slope[0] * im + slope[1] * re + value[1]
             value = value[0] * re - value[1] * im + c[k][None], value[0] * im + value[1] * re
         newton = _quotient(value, slope)
-        apart = re[:, None] - re[None], im[:, None] - im[None]
-        squared = apart[0] ** 2 + apart[1] ** 2
+        difference = re[:, None] - re[None], im[:, None] - im[None]
+        squared = difference[0] ** 2 + difference[1] ** 2
         inverse = jnp.where(squared > 0, 1.0 / jnp.where(squared > 0, squared, 1.0), 0.0)
-        pull = jnp.sum(apart[0] * inverse, axis=1), -jnp.sum(apart[1] * inverse, axis=1)
-        keep = 1.0 - (newton[0] * pull[0] - newton[1] * pull[1]), -(newton[0] * pull[1] + newton[1] * pull[0])
+        repulsion = jnp.sum(difference[0] * inverse, axis=1), -jnp.sum(difference[1] * inverse, axis=1)
+        keep = (
+            1.0 - (newton[0] * repulsion[0] - newton[1] * repulsion[1]),
+            -(newton[0] * repulsion[1] + newton[1] * repulsion[0]),
+        )
         shift = _quotient(newton, keep)
         good = jnp.isfinite(shift[0]) & jnp.isfinite(shift[1])
         return jnp.where(good, re - shift[0], re), jnp.where(good, im - shift[1], im)
 
-    re, im = lax.fori_loop(0, _ROOT_STEPS, step, (start[0], start[1]))
+    re, im = lax.fori_loop(0, _ROOT_STEPS, step, (initial[0], initial[1]))
     real = jnp.abs(im) < (tiny**0.3) * (1.0 + jnp.abs(re))
     return jnp.clip(re, -1e4, 1e4), real & known[None]
 
@@ -250,7 +253,7 @@ def _quotient(top: tuple[Array, Array], bottom: tuple[Array, Array]) -> tuple[Ar
 
 
 def decompose(essential: Float[Array, "3 3"]) -> RelativePose:
-    """One of the four poses of an essential matrix; the others are its mirror and its twist.
+    """One of the four poses of an essential matrix; `facing` chooses among them.
 
     References:
         Horn, "Recovering baseline and orientation from essential matrix", 1990.
@@ -285,7 +288,7 @@ def facing(
     second: Float[Array, "n 3"],
     weight: Float[Array, " n"] | None = None,
 ) -> RelativePose:
-    """Of the four poses with the same essential matrix, the one with most points ahead of both cameras.
+    """Cheirality test: of the four poses of an essential matrix, the one with most points in front of both cameras.
 
     Args:
         pose: any of the four.
@@ -298,17 +301,17 @@ def facing(
     """
     t, rotation = pose.direction.vector, pose.rotation.matrix()
     weight = jnp.ones(first.shape[:1], first.dtype) if weight is None else weight
-    # A half turn about the baseline.
-    twist = 2.0 * t[:, None] * t[None, :] - jnp.eye(3, dtype=t.dtype)
-    turns = jnp.stack([rotation, matmul(twist, rotation)])
+    # Rotation by 180 degrees about the baseline.
+    half_turn = 2.0 * t[:, None] * t[None, :] - jnp.eye(3, dtype=t.dtype)
+    turns = jnp.stack([rotation, matmul(half_turn, rotation)])
 
-    def votes(turn: Array) -> Float[Array, "2"]:
+    def count(turn: Array) -> Float[Array, "2"]:
         turned = matmul(second, turn.T)
         signs = depth_signs(t, first, turned)
         both = jnp.all(signs > 0, axis=0), jnp.all(signs < 0, axis=0)
         return jnp.stack([jnp.sum(jnp.where(good, weight, 0.0)) for good in both])
 
-    best = jnp.argmax(jax.vmap(votes)(turns).reshape(-1))
+    best = jnp.argmax(jax.vmap(count)(turns).reshape(-1))
     sign = jnp.where(best % 2 == 0, 1.0, -1.0).astype(t.dtype)
     return RelativePose(Direction(sign * t), SO3(turns[best // 2]))
 
@@ -317,14 +320,14 @@ def _coplanarities(pose: RelativePose, first: Array, second: Array) -> Float[Arr
     return jnp.sum(first * matmul(second, pose.essential().T), axis=1)
 
 
-def polished(pose: RelativePose, first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> RelativePose:
+def polish(pose: RelativePose, first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> RelativePose:
     """Newton steps on the manifold: five equations, five unknowns."""
     zero = jnp.zeros(5, first.dtype)
 
     def improve(_: Any, pose: RelativePose) -> RelativePose:
         residual = lambda delta: _coplanarities(retract(pose, delta), first, second)  # noqa: E731
         jacobian = jax.jacfwd(residual)(zero)
-        # Squared, but with its small pivots guarded.
+        # Normal equations, with small pivots guarded.
         step = factor(matmul(jacobian.T, jacobian)).solve(matmul(jacobian.T, residual(zero)))
         return retract(pose, -jnp.clip(jnp.where(jnp.isfinite(step), step, 0.0), -0.1, 0.1))
 
@@ -336,10 +339,10 @@ def _explains(pose: RelativePose, first: Array, second: Array) -> Bool[Array, ""
     return jnp.max(jnp.abs(_coplanarities(pose, first, second))) < tolerance
 
 
-def _once(poses: RelativePose, valid: Bool[Array, "10"]) -> Bool[Array, "10"]:
-    """False for what repeats an earlier solution."""
+def _is_first(poses: RelativePose, valid: Bool[Array, "10"]) -> Bool[Array, "10"]:
+    """False for solutions that repeat an earlier one."""
     flat = jax.vmap(lambda pose: pose.essential().reshape(-1))(poses)
-    apart = jnp.max(jnp.abs(flat[:, None] - flat[None]), axis=2)
+    distance = jnp.max(jnp.abs(flat[:, None] - flat[None]), axis=2)
     index = jnp.arange(10)
     near = 10.0 * float(jnp.finfo(flat.dtype).eps) ** 0.5
-    return ~jnp.any((apart < near) & valid[None, :] & (index[None, :] < index[:, None]), axis=1)
+    return ~jnp.any((distance < near) & valid[None, :] & (index[None, :] < index[:, None]), axis=1)

@@ -1,7 +1,7 @@
-"""Fundamental matrices in closed form: from eight and more points, and from seven.
+"""Eight-point and seven-point algorithms for the fundamental matrix.
 
-The convention is that of `epipolar`: ``x1^T F x2 = 0``. No derivative passes through a singular value decomposition:
-null vectors and roots are found without derivatives, and one Newton step on the equations that they fulfill gives those
+The convention is that of `epipolar`: ``x1^T F x2 = 0``. The singular value decomposition is not differentiated:
+null vectors and roots are found without derivatives, and one Newton step on their defining equations gives those
 of the implicit function.
 """
 
@@ -19,17 +19,17 @@ from jaxloc.multiview.homography import normalizer
 
 _LEAST, _MINIMAL = 8, 7
 _POLISH_STEPS = 3
-# The null vector is believed when the next singular value is this many times its own: noise of its size is not.
+# The null vector is accepted when the next singular value exceeds its own by this factor.
 _SEPARATION = 2.0
 
 
 class FundamentalMatrix(eqx.Module):
-    """What the eight-point algorithm finds.
+    """Result of the eight-point algorithm.
 
     Attributes:
         matrix: "3 3" of rank two and unit Frobenius norm.
         separation: the second smallest singular value of the equations over the smallest, at most one over rounding:
-            how well conditioned the answer is. Near one for points of a plane, for a rotation alone, and for noise.
+            a measure of conditioning. Near one for points of a plane, for a rotation alone, and for noise.
         ok: whether the points determine the matrix. Gradients are zero where it is False.
     """
 
@@ -39,7 +39,7 @@ class FundamentalMatrix(eqx.Module):
 
 
 class FundamentalMatrices(eqx.Module):
-    """The candidates of the seven-point algorithm, stacked, and which of them are solutions."""
+    """Solutions of the seven-point algorithm, stacked, and which entries are valid."""
 
     matrices: Float[Array, "3 3 3"]
     valid: Bool[Array, "3"]
@@ -53,21 +53,21 @@ def eight_point(
     weights: Float[Array, " n"] | None = None,
     valid: Bool[Array, " n"] | None = None,
 ) -> FundamentalMatrix:
-    """Fundamental matrix from eight or more pairs of points, linear least squares in normalized coordinates.
+    """Eight-point algorithm: fundamental matrix by linear least squares in normalized coordinates.
 
-    Minimizes ``sum w_i (x1_i^T F x2_i)^2`` over unit ``F`` after both sets were brought around the origin at distances
-    near one, then takes the nearest matrix of rank two. A good start; `two_view` refines.
+    Minimizes ``sum w_i (x1_i^T F x2_i)^2`` over unit ``F`` after normalization to zero mean and mean distance
+    one, then takes the nearest matrix of rank two. An initial value for `two_view`.
 
     Args:
         first: points of the first image, px (or normalized coordinates: the essential matrix, nearly).
-        second: their partners in the second image.
-        weights: of each pair, one by default; pairs with weight zero do not count.
-        valid: which pairs count; numbers that are not finite never do.
+        second: the corresponding points of the second image.
+        weights: of each pair, one by default; pairs with weight zero are ignored.
+        valid: pairs that are used; non-finite ones never are.
 
     Returns:
-        The matrix. ``ok`` is False with fewer than eight pairs, and where the equations leave more than one direction
-        open: points of one plane, on a line, or all in one place, and cameras that only turn. Eight noisy points fit
-        exactly, so that their noise cannot be told from structure: more of them are judged better.
+        The matrix. ``ok`` is False with fewer than eight pairs, and where the equations do not determine the solution:
+        points of one plane, on a line, or all in one place, and cameras that only rotate. Eight noisy points fit
+        exactly, so that noise cannot be distinguished from structure: the test is more reliable with more points.
 
     Raises:
         ValueError: fewer than eight pairs.
@@ -90,8 +90,8 @@ def eight_point(
     """
     if first.shape[0] < _LEAST:
         raise ValueError(f"The eight-point algorithm needs {_LEAST} pairs; there are {first.shape[0]}.")
-    counts, first, second, weight = _usable(first, second, weights, valid)
-    (to_first, x1), (to_second, x2) = (_normalized(points.T, counts) for points in (first, second))
+    used, first, second, weight = _usable(first, second, weights, valid)
+    (to_first, x1), (to_second, x2) = (_normalized(points.T, used) for points in (first, second))
     rows = (x1[:, None] * x2[None]).reshape(9, -1) * jnp.sqrt(weight)[None, :]
     rows = jnp.concatenate([rows, jnp.zeros((9, 1), rows.dtype)], axis=1)  # at least nine equations
     vector, values = _null_direction(rows.T)
@@ -101,23 +101,23 @@ def eight_point(
     matrix = _unit(matmul(to_first.T, matmul(matrix, to_second)))
     floor = 10.0 * float(jnp.finfo(values.dtype).eps) * values[0]
     separation = values[-2] / jnp.maximum(jnp.maximum(values[-1], floor), float(jnp.finfo(values.dtype).tiny))
-    ok = (jnp.sum(counts) >= _LEAST) & (values[-2] > _SEPARATION * jnp.maximum(values[-1], floor))
+    ok = (jnp.sum(used) >= _LEAST) & (values[-2] > _SEPARATION * jnp.maximum(values[-1], floor))
     matrix = jnp.where(jnp.all(jnp.isfinite(matrix)), matrix, 0.0)
     return FundamentalMatrix(jnp.where(ok, matrix, lax.stop_gradient(matrix)), separation, ok)
 
 
 @eqx.filter_jit
 def seven_point(first: Float[Array, "7 2"], second: Float[Array, "7 2"]) -> FundamentalMatrices:
-    """Fundamental matrices of seven pairs of points: one to three.
+    """Seven-point algorithm: one to three fundamental matrices.
 
-    Seven equations leave ``F = c A + s B`` open; ``det F = 0`` is a cubic.
+    Seven equations determine ``F = c A + s B`` up to one parameter; ``det F = 0`` is a cubic.
 
     Args:
         first: points of the first image, px.
-        second: their partners in the second image.
+        second: the corresponding points of the second image.
 
     Returns:
-        Three candidates of unit Frobenius norm; `valid` marks solutions. With derivatives; everything stays finite.
+        Three candidates of unit Frobenius norm; `valid` marks solutions. With derivatives; all values are finite.
 
     References:
         Hartley and Zisserman, *Multiple View Geometry*, 2004, section 11.1.2.
@@ -135,27 +135,27 @@ def seven_point(first: Float[Array, "7 2"], second: Float[Array, "7 2"]) -> Fund
         >>> bool(found.valid.any()), bool((off < 0.05)[found.valid].all())
         (True, True)
     """
-    counts, first, second, _ = _usable(first, second, None, None)
-    (to_first, x1), (to_second, x2) = (_normalized(points.T, counts) for points in (first, second))
+    used, first, second, _ = _usable(first, second, None, None)
+    (to_first, x1), (to_second, x2) = (_normalized(points.T, used) for points in (first, second))
     rows = (x1[:, None] * x2[None]).reshape(9, -1).T
-    still = lax.stop_gradient(rows)
-    q, r = jnp.linalg.qr(still.T, mode="complete")
+    frozen = lax.stop_gradient(rows)
+    q, r = jnp.linalg.qr(frozen.T, mode="complete")
     diagonal = jnp.abs(jnp.diagonal(r))
-    spans = jnp.all(counts) & (jnp.min(diagonal) > 1e2 * float(jnp.finfo(rows.dtype).eps) * jnp.max(diagonal))
+    spans = jnp.all(used) & (jnp.min(diagonal) > 1e2 * float(jnp.finfo(rows.dtype).eps) * jnp.max(diagonal))
     pencil, roots = _singular_members(q[:, 7].reshape(3, 3), q[:, 8].reshape(3, 3))
 
     def candidate(root: Array) -> tuple[Array, Array]:
         matrix = _unit(pencil[0] + root * pencil[1])
         for _ in range(_POLISH_STEPS):
-            matrix = _unit(matrix - _newton(still, still, matrix))
-        miss = jnp.max(jnp.abs(_equations(still, matrix)))
+            matrix = _unit(matrix - _newton(frozen, frozen, matrix))
+        miss = jnp.max(jnp.abs(_equations(frozen, matrix)))
         good = spans & (miss < 1e2 * float(jnp.finfo(rows.dtype).eps))
-        step = _newton(rows, still, matrix)
+        step = _newton(rows, frozen, matrix)
         matrix = matrix - jnp.where(good, step - lax.stop_gradient(step), 0.0)
         return _unit(matmul(to_first.T, matmul(matrix, to_second))), good
 
     matrices, good = jax.vmap(candidate)(roots.values)
-    good = good & roots.real & _once(matrices, good & roots.real)
+    good = good & roots.real & _is_first(matrices, good & roots.real)
     finite = jnp.isfinite(matrices)
     matrices = jnp.where(finite, matrices, 0.0)
     return FundamentalMatrices(jnp.where(good[:, None, None], matrices, lax.stop_gradient(matrices)), good)
@@ -164,28 +164,28 @@ def seven_point(first: Float[Array, "7 2"], second: Float[Array, "7 2"]) -> Fund
 def _usable(
     first: Array, second: Array, weights: Array | None, valid: Array | None
 ) -> tuple[Bool[Array, " n"], Array, Array, Float[Array, " n"]]:
-    """Which pairs count, and points and weights with bad numbers replaced."""
-    counts = jnp.all(jnp.isfinite(first), axis=1) & jnp.all(jnp.isfinite(second), axis=1)
-    counts = counts if valid is None else counts & valid
+    """Mask of the pairs in use, and points and weights with non-finite values replaced."""
+    used = jnp.all(jnp.isfinite(first), axis=1) & jnp.all(jnp.isfinite(second), axis=1)
+    used = used if valid is None else used & valid
     weight = jnp.ones(first.shape[:1], first.dtype) if weights is None else lax.stop_gradient(weights)
-    counts = counts & jnp.isfinite(weight) & (weight > 0)
-    first, second = (jnp.where(counts[:, None], points, 0.0) for points in (first, second))
-    return counts, first, second, jnp.where(counts, weight, 0.0)
+    used = used & jnp.isfinite(weight) & (weight > 0)
+    first, second = (jnp.where(used[:, None], points, 0.0) for points in (first, second))
+    return used, first, second, jnp.where(used, weight, 0.0)
 
 
-def _normalized(points: Float[Array, "2 n"], counts: Bool[Array, " n"]) -> tuple[Float[Array, "3 3"], Array]:
-    """A similarity, and homogeneous points after it: zero where they do not count."""
-    similarity, moved = normalizer(points, counts)
-    return similarity, jnp.where(counts[None, :], homogeneous(moved.T), 0.0)
+def _normalized(points: Float[Array, "2 n"], used: Bool[Array, " n"]) -> tuple[Float[Array, "3 3"], Array]:
+    """A similarity, and the mapped homogeneous points; zero where masked."""
+    similarity, moved = normalizer(points, used)
+    return similarity, jnp.where(used[None, :], homogeneous(moved.T), 0.0)
 
 
 def _null_direction(rows: Float[Array, "m k"]) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    """Unit vector that the rows change least, and their singular values.
+    """Right singular vector of the smallest singular value, and all singular values.
 
-    With ``M = rows^T rows`` and its other pairs (s_k^2, v_k), ``dv = -sum v_k v_k^T dM v / (s_k^2 - s^2)``.
+    Derivative: with ``M = rows^T rows`` and its other pairs (s_k^2, v_k), ``dv = -sum v_k v_k^T dM v / (s_k^2 - s^2)``.
     """
-    still = lax.stop_gradient(rows)
-    _, values, right = jnp.linalg.svd(jnp.where(jnp.isfinite(still), still, 0.0), full_matrices=False)
+    frozen = lax.stop_gradient(rows)
+    _, values, right = jnp.linalg.svd(jnp.where(jnp.isfinite(frozen), frozen, 0.0), full_matrices=False)
     vector, others = right[-1], right[:-1]
     gaps = values[:-1] ** 2 - values[-1] ** 2
     clear = gaps > (10.0 * float(jnp.finfo(values.dtype).eps) * values[0]) ** 2
@@ -203,7 +203,7 @@ class _Roots(NamedTuple):
 
 
 def _singular_members(first: Float[Array, "3 3"], second: Float[Array, "3 3"]) -> tuple[Float[Array, "2 3 3"], _Roots]:
-    """A basis of the pencil whose second member is far from singular, and where ``det(basis[0] + t basis[1]) = 0``."""
+    """A basis of the pencil, the second matrix far from singular, and the roots of ``det(basis[0] + t basis[1])``."""
     angles = jnp.arange(6, dtype=first.dtype) * (jnp.pi / 6.0)
     turned = jnp.cos(angles)[:, None, None] * first[None] + jnp.sin(angles)[:, None, None] * second[None]
     best = jnp.argmax(jnp.abs(jax.vmap(_determinant)(turned)))
@@ -217,7 +217,7 @@ def _singular_members(first: Float[Array, "3 3"], second: Float[Array, "3 3"]) -
 
 
 def _cubic(a: Array, b: Array, c: Array) -> _Roots:
-    """Roots of ``t^3 + a t^2 + b t + c``; a pair that is complex by rounding alone counts as real."""
+    """Roots of ``t^3 + a t^2 + b t + c``; a pair that is complex by rounding alone used as real."""
     shift = a / 3.0
     p, q = b / 3.0 - shift**2, shift**3 - 0.5 * shift * b + 0.5 * c  # y^3 + 3 p y + 2 q = 0
     discriminant = q * q + p**3
@@ -244,15 +244,15 @@ def _determinant(matrix: Float[Array, "3 3"]) -> Float[Array, ""]:
 
 
 def _equations(rows: Float[Array, "7 9"], matrix: Float[Array, "3 3"]) -> Float[Array, "9"]:
-    """What a fundamental matrix of unit norm makes zero: seven points, the determinant, the norm."""
+    """Residuals of the seven epipolar constraints, the determinant and the norm."""
     scale = jnp.stack([_determinant(matrix), jnp.sum(matrix * matrix) - 1.0])
     return jnp.concatenate([matmul(rows, matrix.reshape(9)), scale])
 
 
-def _newton(rows: Float[Array, "7 9"], still: Float[Array, "7 9"], matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Newton's step, with derivatives by the rows alone; none where the solution is not isolated."""
+def _newton(rows: Float[Array, "7 9"], frozen: Float[Array, "7 9"], matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Newton step, with derivatives by the rows alone; zero where the solution is not isolated."""
     last = jnp.stack([_cofactors(matrix).reshape(9), 2.0 * matrix.reshape(9)])
-    inverse = jnp.linalg.inv(lax.stop_gradient(jnp.concatenate([still, last])))
+    inverse = jnp.linalg.inv(lax.stop_gradient(jnp.concatenate([frozen, last])))
     inverse = jnp.where(jnp.all(jnp.isfinite(inverse)), inverse, 0.0)
     return matmul(inverse, _equations(rows, matrix)).reshape(3, 3)
 
@@ -263,8 +263,8 @@ def _unit(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     return jnp.where(good, matrix, 0.0) / jnp.sqrt(jnp.where(good, squared, 1.0))
 
 
-def _once(matrices: Float[Array, "3 3 3"], valid: Bool[Array, "3"]) -> Bool[Array, "3"]:
-    """False for what repeats an earlier solution, up to sign."""
+def _is_first(matrices: Float[Array, "3 3 3"], valid: Bool[Array, "3"]) -> Bool[Array, "3"]:
+    """False for solutions that repeat an earlier one, up to sign."""
     flat = lax.stop_gradient(matrices).reshape(3, 9)
     alike = jnp.abs(jnp.sum(flat[:, None] * flat[None], axis=2))
     index = jnp.arange(3)

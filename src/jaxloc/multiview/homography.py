@@ -1,6 +1,6 @@
-"""Homographies of points: in closed form, and robustly, with covariance.
+"""Homographies from point correspondences: closed forms, and a robust estimate with covariance.
 
-A closed form carries no derivatives; what is refined has those of its minimum.
+Closed forms have no derivatives; refined estimates have those of their minimum.
 """
 
 from typing import Any
@@ -17,20 +17,20 @@ from jaxloc.poses import SE3, Direction
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Loss, Problem, Quadratic, RobustEstimate, Tukey, ransac, solve
 
-# 99 % of the squared distance of two whitened components, as a distance.
+# Root of the 99 % quantile of chi-square with two degrees of freedom.
 _GATE = 3.035
-# Of Tukey's kernel on two components: 95 % efficient.
+# Scale of Tukey's kernel on two components for 95 % efficiency.
 _TUKEY = 5.12
 _SAMPLE = 4
 
 
 @eqx.filter_jit
-def of_plane(
+def plane_homography(
     first: Pinhole, second: Pinhole, T_first_second: SE3, normal: Direction, distance: Float[Array, ""]
 ) -> Homography:
-    """Homography from pixels of the first camera to those of the second, of a plane ``n . x = d``.
+    """Homography induced by a plane ``n . x = d``, from pixels of the first camera to those of the second.
 
-    ``H = K2 R^T (I - t n^T / d) K1^-1`` with ``T_first_second = (R, t)``; lenses are left out.
+    ``H = K2 R^T (I - t n^T / d) K1^-1`` with ``T_first_second = (R, t)``; pixels are undistorted.
 
     Args:
         first: the first camera.
@@ -50,7 +50,7 @@ def of_plane(
         >>> camera = jl.sensors.Pinhole(100.0, 100.0, 50.0, 50.0)
         >>> step = jl.poses.SE3.from_euler(jnp.array([0.1, 0.0, 0.0]), 0.0, 0.0, 0.0)
         >>> wall = jl.poses.Direction(jnp.array([0.0, 0.0, 1.0]))
-        >>> found = jl.multiview.homography.of_plane(camera, camera, step, wall, jnp.array(2.0))
+        >>> found = jl.multiview.homography.plane_homography(camera, camera, step, wall, jnp.array(2.0))
         >>> [round(float(x), 2) for x in found.apply(jnp.array([[50.0, 50.0]]))[0]]
         [45.0, 50.0]
     """
@@ -62,15 +62,15 @@ def of_plane(
 def direct_linear_transform(
     points: Float[Array, "2 m"], pixels: Float[Array, "2 m"], valid: Bool[Array, " m"]
 ) -> Float[Array, "3 3"]:
-    """Homography from points of a plane to pixels: the normalized direct linear transform, without derivatives.
+    """Normalized direct linear transform: homography from points of a plane to pixels, without derivatives.
 
     Args:
         points: of the plane, any unit; finite.
-        pixels: where they appear, px; finite.
-        valid: which count.
+        pixels: the corresponding pixels; finite.
+        valid: pairs that are used.
 
     Returns:
-        Matrix of unit Frobenius norm; finite, but without meaning where fewer than four points count.
+        Matrix of unit Frobenius norm; finite, but meaningless with fewer than four valid points.
 
     References:
         Hartley and Zisserman, *Multiple View Geometry*, 2004, algorithm 4.2.
@@ -81,7 +81,7 @@ def direct_linear_transform(
     one, zero = valid.astype(u.dtype), jnp.zeros_like(u)
     rows_u = jnp.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
     rows_v = jnp.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)
-    # Four points give eight rows: a ninth of zeros keeps the null vector in a thin decomposition.
+    # Four points give eight rows; a ninth of zeros keeps the null vector in the thin decomposition.
     rows = jnp.concatenate([rows_u, rows_v, jnp.zeros_like(rows_u[:1])])
     _, _, right = jnp.linalg.svd(rows, full_matrices=False)
     matrix = matmul(_denormalizer(to_pixels), matmul(right[8].reshape(3, 3), to_points))
@@ -93,7 +93,7 @@ def direct_linear_transform(
 def normalizer(
     points: Float[Array, "2 m"], valid: Bool[Array, " m"]
 ) -> tuple[Float[Array, "3 3"], Float[Array, "2 m"]]:
-    """Similarity that brings points around the origin at distances near one, and the points there; zero if masked.
+    """Hartley normalization: a similarity to zero mean and mean distance one, and the mapped points; zero if masked.
 
     References:
         Hartley, "In defense of the eight-point algorithm", T-PAMI 1997 [R-49].
@@ -102,10 +102,10 @@ def normalizer(
     mean = jnp.sum(jnp.where(valid[None, :], points, 0.0), axis=1) / count
     centered = jnp.where(valid[None, :], points - mean[:, None], 0.0)
     squared = jnp.sum(centered**2) / count
-    spread = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-    zero, one = jnp.zeros_like(spread), jnp.ones_like(spread)
-    rows = [[1.0 / spread, zero, -mean[0] / spread], [zero, 1.0 / spread, -mean[1] / spread], [zero, zero, one]]
-    return jnp.stack([jnp.stack(row) for row in rows]), centered / spread
+    scale = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+    zero, one = jnp.zeros_like(scale), jnp.ones_like(scale)
+    rows = [[1.0 / scale, zero, -mean[0] / scale], [zero, 1.0 / scale, -mean[1] / scale], [zero, zero, one]]
+    return jnp.stack([jnp.stack(row) for row in rows]), centered / scale
 
 
 def _denormalizer(similarity: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
@@ -126,16 +126,16 @@ def _inverse(camera: Pinhole) -> Float[Array, "3 3"]:
 
 @eqx.filter_jit
 def four_points(first: Float[Array, "4 2"], second: Float[Array, "4 2"]) -> Homography:
-    """The homography that takes four points to four others: exact, smooth, without linear solver.
+    """Homography of four point pairs: exact, smooth, without linear solver.
 
     Four points are a frame of the projective plane; the homography is the change from one frame to the other.
 
     Args:
         first: four points, no three on a line.
-        second: where they go.
+        second: the corresponding points.
 
     Returns:
-        The homography; finite, without meaning, where three points lie on a line.
+        The homography; finite, but meaningless where three points lie on a line.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -152,7 +152,7 @@ def four_points(first: Float[Array, "4 2"], second: Float[Array, "4 2"]) -> Homo
 
 
 def _frame(points: Float[Array, "4 2"]) -> Float[Array, "3 3"]:
-    """Matrix that takes the axes and their sum to four points, up to scale."""
+    """Matrix that maps the axes and their sum to four points, up to scale."""
     p = jnp.concatenate([points, jnp.ones_like(points[:, :1])], axis=1)
     weights = jnp.sum(_adjugate(p[:3].T) * p[3][None, :], axis=1)
     return p[:3].T * weights[None, :]
@@ -164,7 +164,7 @@ def _adjugate(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
 
 
 class TransferError(Problem):
-    """Corresponding points of a plane in two images, both with noise; the state is the `Homography`.
+    """Least-squares problem of corresponding points of a plane in two noisy images; the state is the `Homography`.
 
     The error ``e = x2 - H(x1)`` has, to first order, the covariance ``s^2 (I + J J^T)`` with the derivative J of the
     map at ``x1``; it is whitened by that: Sampson's error.
@@ -173,7 +173,7 @@ class TransferError(Problem):
         first: "2 n", px; finite everywhere.
         second: "2 n", px; finite everywhere.
         sigma: standard deviation of a coordinate in either image, px.
-        valid: which count.
+        valid: pairs that are used.
         loss: robust kernel over the two components.
 
     References:
@@ -187,7 +187,7 @@ class TransferError(Problem):
     loss: Any = Quadratic()
 
     def residual(self, state: Homography) -> Float[Array, "2 n"]:
-        """Whitened errors; a point that maps behind the horizon counts as a gross error."""
+        """Whitened errors; points behind the horizon have a large constant error."""
         return transfer_error(state.homogeneous, self.first, self.second, self.sigma, self.valid)
 
 
@@ -198,15 +198,15 @@ def transfer_error(
     sigma: Any,
     valid: Bool[Array, " n"],
 ) -> Float[Array, "2 n"]:
-    """What `TransferError` whitens, of any matrix: 1000 sigmas behind the horizon, zero where masked."""
+    """Whitened transfer errors for any matrix: 1000 sigmas behind the horizon, zero where masked."""
     # Written out, so that many hypotheses become one loop over the points.
     x, y, w = (row[0] * first[0] + row[1] * first[1] + row[2] for row in matrix)
     # The sign of the determinant is one: points of the plane that both cameras see have positive w.
-    # Nearer to the horizon rounding decides about it, and squares of where a point maps overflow.
+    # Near the horizon the sign is rounding, and squared coordinates overflow.
     parts = jnp.abs(matrix[2, 0] * first[0]) + jnp.abs(matrix[2, 1] * first[1]) + jnp.abs(matrix[2, 2])
-    ahead = valid & (w > float(jnp.finfo(w.dtype).eps) ** 0.5 * parts)
-    inverse = 1.0 / jnp.where(ahead, w, 1.0)
-    u, v = jnp.where(ahead, x, 0.0) * inverse, jnp.where(ahead, y, 0.0) * inverse
+    in_front = valid & (w > float(jnp.finfo(w.dtype).eps) ** 0.5 * parts)
+    inverse = 1.0 / jnp.where(in_front, w, 1.0)
+    u, v = jnp.where(in_front, x, 0.0) * inverse, jnp.where(in_front, y, 0.0) * inverse
     by_x = [(matrix[0, i] - u * matrix[2, i]) * inverse for i in range(2)]
     by_y = [(matrix[1, i] - v * matrix[2, i]) * inverse for i in range(2)]
     s00 = 1.0 + by_x[0] ** 2 + by_x[1] ** 2
@@ -217,7 +217,7 @@ def transfer_error(
     lower = s01 / s00
     rest = jnp.sqrt(jnp.maximum(s11 - s01 * lower, 1.0 / s00))
     whitened = jnp.stack([e0 / root, (e1 - lower * e0) / rest]) / sigma
-    return jnp.where(ahead[None, :], whitened, jnp.where(valid, 1e3, 0.0).astype(whitened.dtype)[None, :])
+    return jnp.where(in_front[None, :], whitened, jnp.where(valid, 1e3, 0.0).astype(whitened.dtype)[None, :])
 
 
 def _fit_sample(sample: tuple[Array, Array, Array]) -> Homography:
@@ -226,8 +226,8 @@ def _fit_sample(sample: tuple[Array, Array, Array]) -> Homography:
 
 def _distance(model: Homography, data: tuple[Array, Array, Array]) -> Float[Array, " n"]:
     first, second, sigma = data
-    everyone = jnp.ones(first.shape[:1], bool)
-    return jnp.sqrt(jnp.sum(transfer_error(model.homogeneous, first.T, second.T, sigma[0], everyone) ** 2, axis=0))
+    valid = jnp.ones(first.shape[:1], bool)
+    return jnp.sqrt(jnp.sum(transfer_error(model.homogeneous, first.T, second.T, sigma[0], valid) ** 2, axis=0))
 
 
 @eqx.filter_jit
@@ -280,15 +280,15 @@ def estimate_homography(
     data = jax.lax.stop_gradient((first, second, jnp.broadcast_to(sigma, first.shape[:1])))
     options = {"sample_size": _SAMPLE, "threshold": _GATE, "hypotheses": hypotheses}
     found = ransac(data, _fit_sample, _distance, **options, key=key, valid=valid)
-    start = _refitted(found.model, data, found.inliers, valid)
+    initial = _refit(found.model, data, found.inliers, valid)
     loss = Tukey(jnp.asarray(_TUKEY, first.dtype)) if loss is None else loss
-    fit = solve(TransferError(first.T, second.T, sigma, valid, loss), start, solver=LevenbergMarquardt())
+    fit = solve(TransferError(first.T, second.T, sigma, valid, loss), initial, solver=LevenbergMarquardt())
     inliers = valid & (_distance(jax.lax.stop_gradient(fit.value), data) < _GATE)
     return _validate(fit, found.ok & (jnp.sum(inliers) > _SAMPLE), inliers)
 
 
-def _refitted(model: Homography, data: Any, inliers: Array, valid: Array) -> Homography:
-    """The sample's model fitted to its inliers, where that draws more of them in."""
+def _refit(model: Homography, data: Any, inliers: Array, valid: Array) -> Homography:
+    """The model refitted to its inliers, if that does not lose inliers."""
     first, second, _ = data
     again = Homography.from_matrix(direct_linear_transform(first.T, second.T, inliers))
     better = jnp.sum(valid & (_distance(again, data) < _GATE)) >= jnp.sum(inliers)

@@ -1,4 +1,4 @@
-"""Poses from the fewest correspondences: what hypothesize-and-test needs by the thousand."""
+"""P3P: camera poses from three points, the minimal solver of RANSAC for PnP."""
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ _POLISH_STEPS = 6
 
 
 class MinimalPoses(eqx.Module):
-    """The candidates of a minimal solver: ``T_world_camera`` stacked, and which of them are solutions."""
+    """Solutions of a minimal solver: poses, stacked, and which entries are valid."""
 
     poses: SE3
     valid: Bool[Array, " k"]
@@ -21,12 +21,12 @@ class MinimalPoses(eqx.Module):
 
 @eqx.filter_jit
 def p3p(rays: Float[Array, "3 3"], points_world: Float[Array, "3 3"]) -> MinimalPoses:
-    """Camera poses that see three points along three rays: up to four.
+    """Camera poses from three points and their rays: up to four.
 
     The distances l_i of the points obey ``|l_i r_i - l_j r_j|^2 = |X_i - X_j|^2``, evaluated as
-    ``(l_i - l_j)^2 + l_i l_j |r_i - r_j|^2``, where nothing large cancels. Eliminating the scale leaves two
+    ``(l_i - l_j)^2 + l_i l_j |r_i - r_j|^2``, which avoids cancellation. Eliminating the scale leaves two
     conics; the best conditioned degenerate conic of their pencil (one real root of a cubic) splits into two lines, each
-    of which meets the others in two candidates. Newton steps on the distances polish them; the last one carries the
+    of which intersects the others in two candidates. They are refined by Newton steps; the last one has the
     derivatives of the implicit function.
 
     Args:
@@ -34,8 +34,8 @@ def p3p(rays: Float[Array, "3 3"], points_world: Float[Array, "3 3"]) -> Minimal
         points_world: "3 3", world frame, m, one a row.
 
     Returns:
-        Four candidates that map camera to world; `valid` marks solutions with positive distances, each once. Collinear
-        points give none; everything stays finite. Where two solutions nearly meet, half of the digits are left: in
+        Four candidates that map camera to world; `valid` marks distinct solutions with positive distances. Collinear
+        points give none; all values are finite. Where two solutions nearly coincide, half of the digits are lost: in
         float32 three in a thousand random problems err by more than 1e-3.
 
     References:
@@ -62,7 +62,7 @@ def p3p(rays: Float[Array, "3 3"], points_world: Float[Array, "3 3"]) -> Minimal
     root = lax.stop_gradient(jnp.sqrt(safe_size))
 
     def candidate(direction):
-        distances = _polished(frozen_chords, _scaled(frozen_chords, direction), shape)
+        distances = _polish(frozen_chords, _scaled(frozen_chords, direction), shape)
         residual, _ = _equations(frozen_chords, distances, shape)
         tolerance = 1e3 * float(jnp.finfo(shape.dtype).eps)
         valid = jnp.all(distances > 0) & (jnp.max(jnp.abs(residual)) < tolerance)
@@ -71,18 +71,18 @@ def p3p(rays: Float[Array, "3 3"], points_world: Float[Array, "3 3"]) -> Minimal
         return distances - jnp.where(valid, _solve(lax.stop_gradient(jacobian), live), 0.0), valid
 
     distances, valid = jax.vmap(candidate)(directions)
-    valid &= _first_of_its_kind(lax.stop_gradient(distances), valid)
-    frame_world, spread = _frame(points_world[1] - points_world[0], points_world[2] - points_world[0])
+    valid &= _is_first(lax.stop_gradient(distances), valid)
+    frame_world, squared_sine = _frame(points_world[1] - points_world[0], points_world[2] - points_world[0])
 
     def pose(distances):
-        # Between points: neighbors' rays differ exactly, their points would cancel.
+        # From differences of rays, which are exact; differences of points would cancel.
         edges = [(distances[k] - distances[0]) * rays[k] + distances[0] * (rays[k] - rays[0]) for k in (1, 2)]
         rotation = _product(frame_world, _frame(*edges)[0].T)
         middle = jnp.mean(distances[:, None] * rays, axis=0)
         translation = jnp.mean(points_world, axis=0) - jnp.sum(rotation * middle[None], axis=1)
         return SE3(SO3.from_matrix(rotation), translation)
 
-    return MinimalPoses(jax.vmap(pose)(distances), valid & (spread > 1e3 * float(jnp.finfo(shape.dtype).eps)))
+    return MinimalPoses(jax.vmap(pose)(distances), valid & (squared_sine > 1e3 * float(jnp.finfo(shape.dtype).eps)))
 
 
 def _directions(chords: Float[Array, "3"], shape: Float[Array, "3"]) -> Float[Array, "4 3"]:
@@ -90,11 +90,11 @@ def _directions(chords: Float[Array, "3"], shape: Float[Array, "3"]) -> Float[Ar
     first, second = _pencil(chords, shape)
     root = _largest_root(*_cubic(first, second))
     degenerate, other = first + root * second, second - root * first
-    return jax.vmap(_meet, in_axes=(0, None))(_lines(degenerate), other).reshape(4, 3)
+    return jax.vmap(_intersect, in_axes=(0, None))(_lines(degenerate), other).reshape(4, 3)
 
 
 def _pencil(chords: Float[Array, "3"], shape: Float[Array, "3"]) -> tuple[Array, Array]:
-    """An orthonormal basis of the conics whose zeros are sought, the second far from degenerate."""
+    """An orthonormal basis of the pencil of conics, the second far from degenerate."""
     quadrics, eye = [], jnp.eye(3, dtype=chords.dtype)
     for (i, j), chord in zip(_PAIRS, chords, strict=True):
         cosine = 1.0 - 0.5 * chord
@@ -127,7 +127,7 @@ def _cubic(first: Array, second: Array) -> tuple[Array, ...]:
 
 
 def _largest_root(c0: Array, c1: Array, c2: Array, c3: Array) -> Array:
-    """The real root of a cubic that lies farthest from the middle of its roots: the best separated one."""
+    """The real root of a cubic farthest from the mean of its roots: the best separated one."""
     c3 = jnp.where(c3 == 0, 1.0, c3)
     a, b, c = c2 / c3 / 3.0, c1 / c3, c0 / c3
     p, q = b / 3.0 - a * a, a**3 - 0.5 * a * b + 0.5 * c  # x^3 + 3 p x + 2 q = 0 with x = t + a
@@ -147,7 +147,7 @@ def _largest_root(c0: Array, c1: Array, c2: Array, c3: Array) -> Array:
 
 
 def _lines(conic: Float[Array, "3 3"]) -> Float[Array, "2 3"]:
-    """The two real lines whose product a degenerate conic is."""
+    """The two real lines of a degenerate conic."""
     product = -_adjugate(conic)
     column = jnp.argmax(jnp.diagonal(product))
     length = jnp.sqrt(jnp.maximum(product[column, column], float(jnp.finfo(conic.dtype).tiny) ** 0.5))
@@ -159,8 +159,8 @@ def _lines(conic: Float[Array, "3 3"]) -> Float[Array, "2 3"]:
     return jnp.stack([outer[largest // 3, :], outer[:, largest % 3]])
 
 
-def _meet(line: Float[Array, "3"], conic: Float[Array, "3 3"]) -> Float[Array, "2 3"]:
-    """The two points where a line meets a conic (of a complex pair, the real middle)."""
+def _intersect(line: Float[Array, "3"], conic: Float[Array, "3 3"]) -> Float[Array, "2 3"]:
+    """The two intersections of a line and a conic (the real part of a complex pair)."""
     line = _unit(line)
     axis = jnp.eye(3, dtype=line.dtype)[jnp.argmin(jnp.abs(line))]
     u = _unit(jnp.cross(line, axis))
@@ -199,7 +199,7 @@ def _solve(slopes: Float[Array, "3 2"], right: Float[Array, "3"]) -> Float[Array
     return jnp.stack([x, y, z]) / jnp.where(determinant == 0, 1.0, determinant)
 
 
-def _polished(chords: Array, distances: Array, shape: Array) -> Array:
+def _polish(chords: Array, distances: Array, shape: Array) -> Array:
     def improve(_, distances):
         residual, slopes = _equations(chords, distances, shape)
         bound = 0.3 * jnp.max(jnp.abs(distances))
@@ -208,8 +208,8 @@ def _polished(chords: Array, distances: Array, shape: Array) -> Array:
     return lax.fori_loop(0, _POLISH_STEPS, improve, distances)
 
 
-def _first_of_its_kind(distances: Float[Array, "4 3"], valid: Bool[Array, "4"]) -> Bool[Array, "4"]:
-    """False for candidates that an earlier valid one repeats: two may polish to one solution."""
+def _is_first(distances: Float[Array, "4 3"], valid: Bool[Array, "4"]) -> Bool[Array, "4"]:
+    """False for candidates that repeat an earlier valid one: two may converge to the same solution."""
     near = 4.0 * float(jnp.finfo(distances.dtype).eps) ** 0.5 * jnp.max(distances)
     same = jnp.max(jnp.abs(distances[:, None] - distances[None]), axis=-1) < near
     index = jnp.arange(4)
@@ -217,12 +217,12 @@ def _first_of_its_kind(distances: Float[Array, "4 3"], valid: Bool[Array, "4"]) 
 
 
 def _frame(first: Float[Array, "3"], second: Float[Array, "3"]) -> tuple[Float[Array, "3 3"], Array]:
-    """Orthonormal axes (columns) of two edges, and how far they are from a line (squared sine of their corner)."""
+    """Orthonormal axes (columns) of two edges, and the squared sine of their angle."""
     first, second = _unit(first), _unit(second)
     normal = jnp.cross(first, second)
-    spread = jnp.sum(normal * normal)
+    squared_sine = jnp.sum(normal * normal)
     z = _unit(normal)
-    return jnp.stack([first, jnp.cross(z, first), z], axis=1), spread
+    return jnp.stack([first, jnp.cross(z, first), z], axis=1), squared_sine
 
 
 def _unit(value: Array) -> Array:
@@ -232,5 +232,5 @@ def _unit(value: Array) -> Array:
 
 
 def _product(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Elementwise sums: batches of tiny library products are slow on CPUs."""
+    """Matrix product by elementwise sums: batches of tiny library products are slow on CPUs."""
     return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)

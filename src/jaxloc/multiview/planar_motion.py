@@ -1,4 +1,4 @@
-"""The motion of a level camera on a flat floor from two features seen twice, without depth."""
+"""Two-point algorithm for planar motion: relative pose of a level camera on a flat floor."""
 
 from typing import Any
 
@@ -17,20 +17,20 @@ _POLISH_STEPS = 4
 
 @eqx.filter_jit
 def planar_relative(first: Float[Array, "2 3"], second: Float[Array, "2 3"]) -> MinimalPoses:
-    """Relative poses of a level camera that rolls on a flat floor and sees the same two points: up to two.
+    """Relative poses of a level camera that moves on a flat floor, from two correspondences: up to two.
 
-    The camera turns about y by an angle a and moves along ``t = (sin p, 0, cos p)``. With ``q = p - a``, coplanarity is
+    The camera rotates about y by a and translates by ``t = (sin p, 0, cos p)``. Coplanarity is, with ``q = p - a``,
     ``y2 (z1 sin p - x1 cos p) + y1 (x2 cos q - z2 sin q) = 0``: two points give two linear equations between two unit
-    vectors, so a quadratic. How far the camera moved stays unknown.
+    vectors, so a quadratic. The length of the translation is not observable.
 
     Args:
         first: rays in the first level frame (x right, y down, z forward), one a row, any length.
         second: rays to the same points in the second frame.
 
     Returns:
-        Two candidates ``T_first_second`` with translations of length one; `valid` marks solutions with both points
-        ahead along their rays, each once. Points on the horizon (y = 0) say nothing of the motion, and with one of them
-        none is valid; so with one feature twice, and for a camera that stands still. Everything stays finite.
+        Candidates ``T_first_second`` with translations of length one; `valid` marks distinct solutions with both
+        points in front of the cameras. None is valid with a point on the horizon (y = 0), with one feature given twice,
+        and without motion. All values are finite.
 
     References:
         Ortin and Montiel, "Indoor robot motion based on monocular images", Robotica 2001; KELLY 9.2.4.3.3 [K-91].
@@ -46,27 +46,27 @@ def planar_relative(first: Float[Array, "2 3"], second: Float[Array, "2 3"]) -> 
     """
     first, second = (unit_rays(rays) for rays in (first, second))
     left, right = _sides(first, second)
-    still = lax.stop_gradient((left, right))
-    headings, good = _closed_form(*still)
+    frozen = lax.stop_gradient((left, right))
+    headings, good = _closed_form(*frozen)
 
     def pose(heading: Array, good: Array) -> tuple[SE3, Array]:
-        heading = _polished(*still, heading)
-        # Reversed translation fits the equations as well.
-        behind = _ahead(first, second, heading + jnp.pi) > _ahead(first, second, heading)
+        heading = _polish(*frozen, heading)
+        # The reversed translation satisfies the equations too.
+        behind = _num_in_front(first, second, heading + jnp.pi) > _num_in_front(first, second, heading)
         heading = heading + jnp.where(behind, jnp.pi, 0.0).astype(heading.dtype)
-        miss = jnp.max(jnp.abs(_equations(*still, heading)))
+        miss = jnp.max(jnp.abs(_equations(*frozen, heading)))
         step, isolated = _step(left, right, heading)
         valid = good & isolated & (miss < 1e2 * float(jnp.finfo(miss.dtype).eps))
-        valid = valid & (_ahead(first, second, heading) == 2)
+        valid = valid & (_num_in_front(first, second, heading) == 2)
         heading = heading - jnp.where(valid, step, 0.0)
         sin, cos = jnp.sin(heading[0]), jnp.cos(heading[0])
         zero = jnp.zeros_like(sin)
         return SE3(SO3(_about_y(heading[0] - heading[1])), jnp.stack([sin, zero, cos])), valid
 
     poses, valid = jax.vmap(pose)(headings, good)
-    apart = jnp.max(jnp.abs(lax.stop_gradient(poses.translation[0] - poses.translation[1])))
-    turned = jnp.abs(lax.stop_gradient(poses.rotation.rotation_matrix[0] - poses.rotation.rotation_matrix[1]))
-    other = jnp.maximum(apart, jnp.max(turned)) > 10.0 * float(jnp.finfo(apart.dtype).eps) ** 0.5
+    distance = jnp.max(jnp.abs(lax.stop_gradient(poses.translation[0] - poses.translation[1])))
+    rotated = jnp.abs(lax.stop_gradient(poses.rotation.rotation_matrix[0] - poses.rotation.rotation_matrix[1]))
+    other = jnp.maximum(distance, jnp.max(rotated)) > 10.0 * float(jnp.finfo(distance.dtype).eps) ** 0.5
     return MinimalPoses(poses, valid & jnp.stack([jnp.array(True), other | ~valid[0]]))
 
 
@@ -90,10 +90,10 @@ def _closed_form(left: Array, right: Array) -> tuple[Float[Array, "2 2"], Bool[A
     radius = jnp.sqrt(along * along + across * across)
     size = jnp.sum(left**2) * jnp.sum(right**2)
     tolerance = float(jnp.finfo(size.dtype).eps)
-    known = (jnp.abs(determinant) > 10.0 * tolerance * jnp.sum(left**2)) & (radius > 10.0 * tolerance * size)
-    ratio = -middle / jnp.where(known, radius, 1.0)
-    real = known & (jnp.abs(ratio) <= 1.0 + tolerance**0.5)
-    half = 0.5 * jnp.arccos(jnp.clip(jnp.where(known, ratio, 0.0), -1.0, 1.0))
+    regular = (jnp.abs(determinant) > 10.0 * tolerance * jnp.sum(left**2)) & (radius > 10.0 * tolerance * size)
+    ratio = -middle / jnp.where(regular, radius, 1.0)
+    real = regular & (jnp.abs(ratio) <= 1.0 + tolerance**0.5)
+    half = 0.5 * jnp.arccos(jnp.clip(jnp.where(regular, ratio, 0.0), -1.0, 1.0))
     phase = 0.5 * jnp.arctan2(across, along)
     q = phase + jnp.stack([half, -half])
     image = -jnp.sign(determinant) * jnp.stack([r[0] * jnp.cos(q) + r[1] * jnp.sin(q) for r in rows])
@@ -106,7 +106,7 @@ def _equations(left: Array, right: Array, angles: Float[Array, "2"]) -> Float[Ar
 
 
 def _step(left: Array, right: Array, angles: Float[Array, "2"]) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
-    """Newton's step with derivatives by the equations alone, and whether the solution is isolated."""
+    """Newton step with derivatives by the equations alone, and whether the solution is isolated."""
     cos, sin = jnp.cos(angles), jnp.sin(angles)
     by_p, by_q = left[:, 1] * cos[0] - left[:, 0] * sin[0], right[:, 1] * cos[1] - right[:, 0] * sin[1]
     by_p, by_q = lax.stop_gradient((by_p, by_q))
@@ -118,7 +118,7 @@ def _step(left: Array, right: Array, angles: Float[Array, "2"]) -> tuple[Float[A
     return jnp.where(isolated, step, 0.0) / jnp.where(isolated, determinant, 1.0), isolated
 
 
-def _polished(left: Array, right: Array, angles: Float[Array, "2"]) -> Float[Array, "2"]:
+def _polish(left: Array, right: Array, angles: Float[Array, "2"]) -> Float[Array, "2"]:
     def improve(_: Any, angles: Array) -> Array:
         return angles - jnp.clip(_step(left, right, angles)[0], -0.1, 0.1)
 
@@ -131,10 +131,10 @@ def _about_y(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
     return jnp.stack([jnp.stack(row) for row in ((cos, zero, sin), (zero, one, zero), (-sin, zero, cos))])
 
 
-def _ahead(first: Array, second: Array, angles: Float[Array, "2"]) -> Array:
-    """How many of the points lie ahead along both rays."""
+def _num_in_front(first: Array, second: Array, angles: Float[Array, "2"]) -> Array:
+    """Number of points in front of both cameras."""
     first, second, angles = lax.stop_gradient((first, second, angles))
-    turned = jnp.sum(_about_y(angles[0] - angles[1])[None] * second[:, None, :], axis=2)
+    rotated = jnp.sum(_about_y(angles[0] - angles[1])[None] * second[:, None, :], axis=2)
     zero = jnp.zeros_like(angles[0])
     heading = jnp.stack([jnp.sin(angles[0]), zero, jnp.cos(angles[0])])
-    return jnp.sum(jnp.all(depth_signs(heading, first, turned) > 0, axis=0))
+    return jnp.sum(jnp.all(depth_signs(heading, first, rotated) > 0, axis=0))

@@ -1,4 +1,4 @@
-"""Two cameras turned, in their images, until rows show the same points; also two that nobody calibrated."""
+"""Stereo rectification: of calibrated pairs by rotations, of uncalibrated ones by homographies."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,13 +14,13 @@ from jaxloc.solvers.cholesky import factor
 
 
 class Rectification(eqx.Module):
-    """How a pair of images becomes one of a `StereoRig`.
+    """Rotations that rectify a pair of cameras, and the rectified `StereoRig`.
 
     Attributes:
         rig: the rectified pair.
         R_rectified_left: rotation from the left camera's frame to the rectified one.
         R_rectified_right: rotation from the right camera's frame.
-        ok: whether the right camera stands to the right of the left one; otherwise nothing is turned.
+        ok: whether the right camera is to the right of the left one; otherwise the rotations are the identity.
     """
 
     rig: StereoRig
@@ -31,11 +31,11 @@ class Rectification(eqx.Module):
 
 @eqx.filter_jit
 def rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, *, shape: tuple[int, int]) -> Rectification:
-    """Turns two cameras so that epipoles lie at infinity and rows are equal.
+    """Rectifies two calibrated cameras: epipoles at infinity, corresponding points in equal rows.
 
-    The rotation between the cameras is shared, half each; then both turn by the smallest rotation that brings the
+    Each camera is rotated by half of the rotation between them; then both by the smallest rotation that brings the
     baseline onto the x axis. The new camera has the mean of the focal lengths, and a principal point that puts the
-    middle of what both see into the middle of the image.
+    center of the common field of view into the center of the image.
 
     Args:
         left: the left camera.
@@ -44,10 +44,10 @@ def rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, *, shape: tuple[in
         shape: (rows, columns) of the images.
 
     Returns:
-        The rotations and the rig, without lens.
+        The rotations and the rig without lens distortion.
 
     References:
-        Thesis figure 2.4 [T-21]; J.-Y. Bouguet's halves, as in OpenCV's ``stereoRectify``.
+        Thesis figure 2.4 [T-21]; J.-Y. Bouguet's method, as in OpenCV's ``stereoRectify``.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -58,7 +58,7 @@ def rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, *, shape: tuple[in
         (True, 0.2)
     """
     half = SO3.exp(0.5 * T_left_right.rotation.log())
-    # The baseline as the cameras see it once both have turned to the orientation between theirs.
+    # The baseline in the frame of the mean orientation of both cameras.
     between = half.inverse().apply(T_left_right.translation[None])[0]
     squared = jnp.sum(between**2)
     length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
@@ -76,25 +76,28 @@ def rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, *, shape: tuple[in
 
 
 @eqx.filter_jit
-def lookup(camera: Pinhole, rotation: SO3, target: Pinhole, *, shape: tuple[int, int]) -> Float[Array, "h w 2"]:
-    """Where each pixel of a rectified image lies in the image of the camera, lens included.
+def rectification_map(
+    camera: Pinhole, rotation: SO3, target: Pinhole, *, shape: tuple[int, int]
+) -> Float[Array, "h w 2"]:
+    """Rectification map: for each pixel of a rectified image, its pixel in the (distorted) image of the camera.
 
-    Reading the image there (`jaxloc.images.interpolation.sample`, or ``cv2.remap`` with the two components) rectifies
-    it. With the identity for a rotation, only the lens is taken out [K-81].
+    Sampling the image there (`jaxloc.images.interpolation.sample`, or ``cv2.remap`` with the two components) rectifies
+    it. With the identity as rotation it only undistorts [K-81].
 
     Args:
-        camera: that took the image.
-        rotation: from its frame to the rectified one.
+        camera: camera of the image.
+        rotation: from the camera's frame to the rectified one.
         target: the rectified camera.
         shape: (rows, columns) of the rectified image.
 
     Returns:
-        Pixels (u, v); (-1, -1), outside any image, where the camera does not look or its lens is not one-to-one.
+        Pixels (u, v); (-1, -1), outside any image, where the ray is not in the camera's field of view.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> camera = jl.sensors.Pinhole(50.0, 50.0, 2.0, 1.0)
-        >>> jl.multiview.rectification.lookup(camera, jl.poses.SO3.identity(), camera, shape=(3, 5))[1, 4].tolist()
+        >>> identity = jl.poses.SO3.identity()
+        >>> jl.multiview.rectification.rectification_map(camera, identity, camera, shape=(3, 5))[1, 4].tolist()
         [4.0, 1.0]
     """
     dtype = camera.fx.dtype
@@ -102,19 +105,19 @@ def lookup(camera: Pinhole, rotation: SO3, target: Pinhole, *, shape: tuple[int,
     x, y = target.normalize_components(u, v)
     rays = jnp.stack([x, y, jnp.ones_like(x)]).reshape(3, -1)
     px, py, pz = matmul(rotation.rotation_matrix.T, rays)
-    seen = camera.in_front_components(px, py, pz)
+    visible = camera.in_front_components(px, py, pz)
     u, v = camera.project_components(px, py, pz)
-    found = jnp.where(seen[None, :], jnp.stack([u, v]), -1.0)
+    found = jnp.where(visible[None, :], jnp.stack([u, v]), -1.0)
     return jnp.moveaxis(found.reshape(2, *shape), 0, -1)
 
 
 class RectifyingPair(eqx.Module):
-    """Maps of two images to a pair with equal rows.
+    """Homographies of two images to a rectified pair.
 
     Attributes:
         first: from pixels of the first image to its rectified ones.
         second: of the second image.
-        ok: whether there are such maps: not when an epipole lies within the image.
+        ok: False when an epipole lies within the image.
     """
 
     first: Homography
@@ -131,17 +134,17 @@ def rectifying_homographies(
     shape: tuple[int, int],
     valid: Bool[Array, " n"] | None = None,
 ) -> RectifyingPair:
-    """Rectifies two images of which only the fundamental matrix is known.
+    """Rectifying homographies of an uncalibrated pair with known fundamental matrix.
 
-    The map of the second image sends its epipole to infinity along x and distorts its middle least; that of the
-    first makes rows equal and, by what is still free, corresponding columns as near as can be.
+    The map of the second image moves its epipole to infinity along x with least distortion at its center; that of the
+    first makes corresponding rows equal and, with its remaining freedom, minimizes the differences of columns.
 
     Args:
         fundamental: F with ``x1^T F x2 = 0``, px.
         first: points of the first image, px.
-        second: their partners.
+        second: the corresponding points.
         shape: (rows, columns) of the images.
-        valid: which pairs count.
+        valid: pairs that are used.
 
     Returns:
         The two maps; the identity where ``ok`` is False.
@@ -162,9 +165,9 @@ def rectifying_homographies(
     weight = (finite if valid is None else finite & valid).astype(first.dtype)
     first, second = (jnp.where(weight[:, None] > 0, points, 0.0) for points in (first, second))
     matrix = jnp.where(jnp.isfinite(fundamental), fundamental, 0.0)
-    epipole, known = null_vector(matrix)
+    epipole, unique = null_vector(matrix)
     of_second, outside = _to_infinity(epipole, shape)
-    # Any map that carries epipolar lines: F^T = [e] M.
+    # A matrix with F^T = [e] M maps epipolar lines.
     transfer = matmul(skew(epipole), _unit(matrix.T)) + epipole[:, None] * jnp.ones((1, 3), epipole.dtype)
     moved = matmul(of_second, transfer)
     x, target = _transferred(moved, first), _transferred(of_second, second)[0]
@@ -172,7 +175,7 @@ def rectifying_homographies(
     row = factor(normal).solve(matmul(x * weight[None, :], target))
     of_first = jnp.concatenate([matmul(row[None, :], moved), moved[1:]])
     regular = jnp.abs(jnp.linalg.det(_unit(of_first))) > float(jnp.finfo(row.dtype).eps)
-    ok = known & outside & regular & (jnp.sum(weight) >= 3) & jnp.all(jnp.isfinite(of_first))
+    ok = unique & outside & regular & (jnp.sum(weight) >= 3) & jnp.all(jnp.isfinite(of_first))
     eye = jnp.eye(3, dtype=row.dtype)
     return RectifyingPair(*(Homography.from_matrix(jnp.where(ok, h, eye)) for h in (of_first, of_second)), ok)
 
@@ -183,7 +186,7 @@ def _unit(matrix: Array) -> Array:
 
 
 def _to_infinity(epipole: Float[Array, "3"], shape: tuple[int, int]) -> tuple[Float[Array, "3 3"], Bool[Array, ""]]:
-    """The map of an image that sends a point to infinity along x, near the identity at the image's middle."""
+    """Homography that moves a point to infinity along x and is near the identity at the image's center."""
     middle = jnp.asarray([0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1)], epipole.dtype)
     zero, one = jnp.zeros_like(epipole[0]), jnp.ones_like(epipole[0])
 
@@ -191,18 +194,18 @@ def _to_infinity(epipole: Float[Array, "3"], shape: tuple[int, int]) -> tuple[Fl
         return jnp.stack([jnp.stack(row) for row in rows])
 
     x, y = epipole[0] - middle[0] * epipole[2], epipole[1] - middle[1] * epipole[2]
-    # Turned by less than a quarter: of the two signs of the homogeneous point, the one to the right.
+    # Of the two signs of the homogeneous point, the one to the right: a rotation of less than 90 degrees.
     sign = jnp.where(x < 0, -1.0, 1.0).astype(x.dtype)
     squared = x * x + y * y
     length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
     cos, sin = sign * x / length, -sign * y / length
-    bend = -sign * epipole[2] / length
-    outside = (squared > 0) & (jnp.abs(bend) * 0.5 * max(shape) < 1.0)
+    slope = -sign * epipole[2] / length
+    outside = (squared > 0) & (jnp.abs(slope) * 0.5 * max(shape) < 1.0)
     center = matrix((one, zero, -middle[0]), (zero, one, -middle[1]), (zero, zero, one))
     turn = matrix((cos, -sin, zero), (sin, cos, zero), (zero, zero, one))
-    push = matrix((one, zero, zero), (zero, one, zero), (bend, zero, one))
+    projective = matrix((one, zero, zero), (zero, one, zero), (slope, zero, one))
     back = matrix((one, zero, middle[0]), (zero, one, middle[1]), (zero, zero, one))
-    return matmul(back, matmul(push, matmul(turn, center))), outside
+    return matmul(back, matmul(projective, matmul(turn, center))), outside
 
 
 def _transferred(matrix: Float[Array, "3 3"], points: Float[Array, "n 2"]) -> Float[Array, "3 n"]:
@@ -212,14 +215,14 @@ def _transferred(matrix: Float[Array, "3 3"], points: Float[Array, "n 2"]) -> Fl
 
 
 def _onto_x(axis: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The smallest rotation of a unit vector onto the x axis, smooth also where it is there."""
+    """The smallest rotation of a unit vector onto the x axis, smooth at the x axis too."""
     zero = jnp.zeros_like(axis[0])
     cross = skew(jnp.stack([zero, axis[2], -axis[1]]))
     return jnp.eye(3, dtype=axis.dtype) + cross + matmul(cross, cross) / (1.0 + axis[0])
 
 
 def _shift(camera: Pinhole, rotation: SO3, focal: Float[Array, ""], shape: tuple[int, int]) -> Float[Array, "2"]:
-    """Principal point that brings the mean of some rays of a camera to the center of the rectified image."""
+    """Principal point that maps the mean of some rays of a camera to the center of the rectified image."""
     rows, columns = shape
     parts = jnp.asarray([0.25, 0.5, 0.75], camera.fx.dtype)
     u, v = jnp.meshgrid(parts * (columns - 1), parts * (rows - 1))

@@ -1,4 +1,4 @@
-"""Points from stereo measurements, with their covariance."""
+"""Triangulation of stereo measurements with covariance: linear, unscented or sampled."""
 
 from abc import abstractmethod
 
@@ -14,7 +14,7 @@ from jaxloc.sensors import StereoRig
 
 
 class TriangulationMethod(eqx.Module):
-    """How pixel noise becomes the covariance of a point."""
+    """Propagation of pixel noise to the covariance of a point."""
 
     @abstractmethod
     def triangulate(self, rig: StereoRig, measured: Gaussian, key: Key[Array, ""] | None) -> Gaussian:
@@ -22,7 +22,7 @@ class TriangulationMethod(eqx.Module):
 
 
 class Linear(TriangulationMethod):
-    """First order: ``J R J^T`` with the analytic Jacobian; right while sigma_d / d stays below about 0.1."""
+    """First-order propagation ``J R J^T``; accurate for sigma_d / d below about 0.1."""
 
     def triangulate(self, rig: StereoRig, measured: Gaussian, key: Key[Array, ""] | None) -> Gaussian:
         """Point and ``J R J^T``."""
@@ -45,7 +45,7 @@ class Unscented(TriangulationMethod):
 
 
 class Sampled(TriangulationMethod):
-    """Moments of random samples; `stereo` then needs a key."""
+    """Moments of random samples; `triangulate` then needs a key."""
 
     num_samples: int = eqx.field(static=True, default=256)
 
@@ -68,14 +68,14 @@ def triangulate(
     method: TriangulationMethod = _LINEAR,
     key: Key[Array, ""] | None = None,
 ) -> Gaussian:
-    """Density of the point that a stereo measurement shows.
+    """Gaussian density of the point of a stereo measurement.
 
     The range is inversely proportional to the disparity: its error grows as ``sigma_z = sqrt(2) sigma z^2 / (f B)``,
-    and its density becomes skewed far away, where `Unscented` keeps the mean and the size that `Linear` loses.
+    and its density is skewed far away, where `Unscented` has the right mean and size and `Linear` does not.
 
     Args:
         rig: the stereo rig.
-        measurement: (u_left, u_right, v), px. Without disparity (`rig.has_depth`) the result is finite but worthless.
+        measurement: (u_left, u_right, v), px. Without disparity (`rig.has_depth`) the result is finite but meaningless.
         covariance: "3 3" of the measurement, px^2.
         method: `Linear()`, `Unscented()` or `Sampled()`.
         key: random key, for `Sampled` only.
@@ -146,14 +146,14 @@ def coverage(
     probability: float = 0.95,
     num_trials: int = 1000,
 ) -> Float[Array, ""]:
-    """How often the ellipsoid of `stereo` holds the true point: it should be the given probability.
+    """Monte Carlo coverage: how often the ellipsoid of `triangulate` contains the true point.
 
     Args:
         rig: the stereo rig.
         point: true point, left camera frame, m.
         covariance: "3 3" of the measurements, px^2.
         key: random key.
-        method: as for `stereo`.
+        method: as for `triangulate`.
         probability: of the ellipsoid.
         num_trials: number of simulated measurements.
 
@@ -184,7 +184,7 @@ def coverage(
 
 
 class _PointOf(eqx.Module):
-    """Triangulation as a function with its rig as data: no new compilation for another rig."""
+    """Triangulation as a pytree with its rig as data, so that another rig does not compile anew."""
 
     rig: StereoRig
 

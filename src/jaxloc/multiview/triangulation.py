@@ -1,4 +1,4 @@
-"""Points where the rays of several cameras meet: closed forms, and the most likely point with its covariance."""
+"""Triangulation from several views: midpoint, optimal correction of two views, and maximum likelihood."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Loss, Problem, Quadratic, solve
 from jaxloc.solvers.cholesky import factor
 
-# Residual, in sigmas, of a point that a camera has behind it.
+# Residual of a point behind a camera, sigmas.
 _UNSEEN = 1e3
 
 
@@ -21,15 +21,15 @@ _UNSEEN = 1e3
 def midpoint(
     centers: Float[Array, "n 3"], rays: Float[Array, "n 3"], *, valid: Bool[Array, " n"] | None = None
 ) -> Float[Array, "3"]:
-    """The point nearest to all rays: ``sum (I - r r^T) (x - c) = 0``.
+    """Midpoint method: the point nearest to all rays, ``sum (I - r r^T) (x - c) = 0``.
 
     Args:
         centers: of the cameras, world frame, m.
         rays: unit bearings, world frame.
-        valid: which count.
+        valid: entries that are used.
 
     Returns:
-        The point, world frame, m; of parallel rays one of many, finite.
+        The point, world frame, m; finite, but not unique for parallel rays.
 
     References:
         Hartley and Sturm, "Triangulation", CVIU 1997, section 5.3 [T-8].
@@ -46,7 +46,7 @@ def midpoint(
     safe_centers = jnp.where(counts[:, None], centers, 0.0)
     eye = jnp.eye(3, dtype=rays.dtype)
     number = jnp.sum(counts).astype(rays.dtype)
-    # About the mean center: the sums then hold the baselines, not the distance from the origin.
+    # Relative to the mean center, for accuracy far from the origin.
     middle = jnp.sum(safe_centers, axis=0) / jnp.maximum(number, 1.0)
     offsets = jnp.where(counts[:, None], safe_centers - middle[None, :], 0.0)
     across = offsets - safe_rays * jnp.sum(safe_rays * offsets, axis=1, keepdims=True)
@@ -58,9 +58,9 @@ def midpoint(
 def correct_pair(
     first: Float[Array, "2"], second: Float[Array, "2"], matrix: Float[Array, "3 3"]
 ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-    """Moves two corresponding points by the least sum of squares until their rays meet: ``x1^T M x2 = 0``.
+    """Optimal correction of two corresponding points: the least sum of squares that fulfills ``x1^T M x2 = 0``.
 
-    Two fixed steps, the first of which solves a quadratic equation; the rest is of the order of rounding. `midpoint` of
+    Two fixed steps, the first of which solves a quadratic equation; the remaining error is rounding. `midpoint` of
     the corrected rays is the optimal point of two views.
 
     Args:
@@ -69,7 +69,7 @@ def correct_pair(
         matrix: fundamental (px) or essential matrix with ``x1^T M x2 = 0``.
 
     Returns:
-        The corrected points. On the epipoles, where nothing is constrained, they stay.
+        The corrected points; points on the epipoles are unchanged.
 
     References:
         Lindstrom, "Triangulation made easy", CVPR 2010, algorithm niter2.
@@ -95,20 +95,20 @@ def correct_pair(
 
 
 def _ratio(top: Float[Array, ""], bottom: Float[Array, ""]) -> Float[Array, ""]:
-    """A quotient of what is not negative below; zero where that is zero."""
+    """Quotient with a nonnegative denominator; zero where that is zero."""
     some = bottom > float(jnp.finfo(bottom.dtype).tiny)
     return jnp.where(some, top / jnp.where(some, bottom, 1.0), 0.0)
 
 
 class TriangulationProblem(Problem):
-    """Pixels of one point in several cameras; the state is the point, world frame.
+    """Least-squares problem of one point in several images; the state is the point, world frame.
 
     Attributes:
         camera: of all images.
         poses: ``T_world_camera``, a stack.
         pixels: "2 n"; finite everywhere.
         sigma: standard deviation of a pixel coordinate, one an image, px.
-        valid: which count.
+        valid: entries that are used.
         loss: robust kernel over the two coordinates.
     """
 
@@ -120,11 +120,11 @@ class TriangulationProblem(Problem):
     loss: Any = Quadratic()
 
     def residual(self, state: Float[Array, "3"]) -> Float[Array, "2 n"]:
-        """Whitened pixel errors; dear where the point lies behind the camera."""
-        c, seen = self._seen(state)
+        """Whitened pixel errors; a large constant where the point is behind the camera."""
+        c, visible = self._in_camera(state)
         error = (jnp.stack(self.camera.project_components(*c)) - self.pixels) / self.sigma[None, :]
-        unseen = jnp.where(self.valid & ~seen, _UNSEEN, 0.0).astype(error.dtype)
-        return jnp.where(seen[None, :], error, unseen[None, :])
+        unseen = jnp.where(self.valid & ~visible, _UNSEEN, 0.0).astype(error.dtype)
+        return jnp.where(visible[None, :], error, unseen[None, :])
 
     def linearize(self, state: Float[Array, "3"]) -> Linearization:
         """Residual and Jacobian by one forward pass for each coordinate."""
@@ -133,15 +133,15 @@ class TriangulationProblem(Problem):
         return Linearization(residual, jax.vmap(push)(columns))
 
     def admissible(self, state: Float[Array, "3"]) -> Bool[Array, ""]:
-        """Whether two cameras have the point before them."""
-        return jnp.sum(self._seen(state)[1]) >= 2
+        """Whether the point is in front of at least two cameras."""
+        return jnp.sum(self._in_camera(state)[1]) >= 2
 
-    def _seen(self, point: Array) -> tuple[tuple[Array, Array, Array], Bool[Array, " n"]]:
+    def _in_camera(self, point: Array) -> tuple[tuple[Array, Array, Array], Bool[Array, " n"]]:
         offsets = (point[None, :] - self.poses.translation)[:, :, None]
         moved = jnp.sum(self.poses.rotation.rotation_matrix * offsets, axis=1)
         x, y, z = moved[:, 0], moved[:, 1], moved[:, 2]
-        seen = self.valid & self.camera.in_front_components(x, y, z)
-        return (jnp.where(seen, x, 0.0), jnp.where(seen, y, 0.0), jnp.where(seen, z, 1.0)), seen
+        visible = self.valid & self.camera.in_front_components(x, y, z)
+        return (jnp.where(visible, x, 0.0), jnp.where(visible, y, 0.0), jnp.where(visible, z, 1.0)), visible
 
 
 @eqx.filter_jit
@@ -154,15 +154,15 @@ def triangulate(
     valid: Bool[Array, " n"] | None = None,
     loss: Loss = Quadratic(),
 ) -> Estimate:
-    """The point that a camera saw from several places: the minimum of the reprojection errors.
+    """Maximum-likelihood triangulation of a point from several views: minimum of the reprojection errors.
 
     Args:
         camera: of all images; for different ones give normalized coordinates, ``Pinhole(1, 1, 0, 0)``, and a sigma
             for each.
         poses: ``T_world_camera``, a stack of n.
-        pixels: where the point was seen, px.
+        pixels: measurements of the point, px.
         sigma: standard deviation of a pixel coordinate, px: a number or one an image.
-        valid: which images count; numbers that are not finite never do.
+        valid: images that are used; non-finite pixels never are.
         loss: robust kernel over the two coordinates of an image.
 
     Returns:
@@ -178,8 +178,8 @@ def triangulate(
         >>> camera = jl.sensors.Pinhole(500.0, 500.0, 320.0, 240.0)
         >>> place = lambda x: jl.poses.SE3.from_euler(jnp.stack([x, 0.0 * x, 0.0 * x]), 0.0, 0.0, 0.0)
         >>> poses = jax.vmap(place)(jnp.array([0.0, 1.0, 2.0]))
-        >>> seen = jnp.array([[420.0, 240.0], [320.0, 240.0], [220.0, 240.0]])
-        >>> found = jl.multiview.triangulation.triangulate(camera, poses, seen, sigma=0.5)
+        >>> pixels = jnp.array([[420.0, 240.0], [320.0, 240.0], [220.0, 240.0]])
+        >>> found = jl.multiview.triangulation.triangulate(camera, poses, pixels, sigma=0.5)
         >>> bool(found.ok), found.value.round(3).tolist()
         (True, [1.0, 0.0, 5.0])
     """
@@ -188,17 +188,17 @@ def triangulate(
     pixels = jnp.where(valid[:, None], pixels, 0.0)
     sigmas = jnp.broadcast_to(jnp.asarray(sigma, pixels.dtype), valid.shape)
     problem = TriangulationProblem(camera, poses, pixels.T, sigmas, valid, loss)
-    return solve(problem, _start(problem), solver=LevenbergMarquardt())
+    return solve(problem, _initial(problem), solver=LevenbergMarquardt())
 
 
-def _start(problem: TriangulationProblem) -> Float[Array, "3"]:
-    """Where the rays meet; far ahead if they meet behind a camera."""
+def _initial(problem: TriangulationProblem) -> Float[Array, "3"]:
+    """The midpoint of the rays; a far point if that is behind a camera."""
     poses, valid = problem.poses, problem.valid
     bearings = problem.camera.bearing(problem.pixels.T)
     rays = jnp.sum(poses.rotation.rotation_matrix * bearings[:, None, :], axis=2)
-    meeting = midpoint(poses.translation, rays, valid=valid)
+    nearest = midpoint(poses.translation, rays, valid=valid)
     count = jnp.maximum(jnp.sum(valid), 1).astype(rays.dtype)
-    middle, ahead = (jnp.sum(jnp.where(valid[:, None], v, 0.0), axis=0) / count for v in (poses.translation, rays))
-    spread = jnp.sqrt(jnp.sum(jnp.where(valid[:, None], (poses.translation - middle[None, :]) ** 2, 0.0)))
-    seen = jnp.sum(problem._seen(meeting)[1]) == jnp.sum(valid)
-    return jnp.where(seen & jnp.all(jnp.isfinite(meeting)), meeting, middle + 30.0 * spread * ahead)
+    middle, forward = (jnp.sum(jnp.where(valid[:, None], v, 0.0), axis=0) / count for v in (poses.translation, rays))
+    extent = jnp.sqrt(jnp.sum(jnp.where(valid[:, None], (poses.translation - middle[None, :]) ** 2, 0.0)))
+    visible = jnp.sum(problem._in_camera(nearest)[1]) == jnp.sum(valid)
+    return jnp.where(visible & jnp.all(jnp.isfinite(nearest)), nearest, middle + 30.0 * extent * forward)

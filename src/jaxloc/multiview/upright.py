@@ -1,7 +1,7 @@
-"""Minimal solvers for cameras that know the vertical, from an accelerometer or because the floor is flat.
+"""Minimal solvers for cameras with known vertical direction, from an accelerometer or a flat floor.
 
 Both frames are level: their y axes point down along gravity, so that rotations between them turn about y alone. Rays of
-a tilted camera are turned level first.
+a tilted camera are rotated to level first.
 """
 
 from typing import Any
@@ -21,17 +21,17 @@ _POLISH_STEPS = 4
 
 @eqx.filter_jit
 def upright_p2p(rays: Float[Array, "2 3"], points_world: Float[Array, "2 3"]) -> MinimalPoses:
-    """Poses of a level camera that sees two points along two rays: up to two.
+    """P2P with known vertical: poses of a level camera from two points and their rays, up to two.
 
-    The heights fix one linear equation of the distances, the horizontal distance of the points a quadratic one.
+    The heights give a linear equation in the distances, the horizontal distance of the points a quadratic one.
 
     Args:
         rays: unit bearings in the level camera frame, one a row.
         points_world: level world frame, m, one a row.
 
     Returns:
-        Two candidates that map camera to world. None is valid for points one above the other, for two rays along the
-        horizon, or for one point; everything stays finite.
+        Two candidates that map camera to world. None is valid for vertically aligned points, for two rays along the
+        horizon, or for coincident points; all values are finite.
 
     References:
         Kukelova, Bujnak, Pajdla, "Closed-form solutions to minimal absolute pose problems with known vertical
@@ -49,9 +49,9 @@ def upright_p2p(rays: Float[Array, "2 3"], points_world: Float[Array, "2 3"]) ->
     rise = points_world[0] - points_world[1]
     across = jnp.stack([rise[0], rise[2]])
     slope = a * a + b * b
-    seen = slope > 1e2 * float(jnp.finfo(rays.dtype).eps) ** 2
-    slope = jnp.where(seen, slope, 1.0)
-    # Distances that fit the heights: a line with a foot and a direction.
+    determined = slope > 1e2 * float(jnp.finfo(rays.dtype).eps) ** 2
+    slope = jnp.where(determined, slope, 1.0)
+    # Distances that fulfill the equation of heights: a line, given by a point and a direction.
     foot, along = rise[1] * jnp.stack([a, -b]) / slope, jnp.stack([b, a]) / jnp.sqrt(slope)
 
     def difference(distances: Array) -> Array:
@@ -59,7 +59,7 @@ def upright_p2p(rays: Float[Array, "2 3"], points_world: Float[Array, "2 3"]) ->
 
     base, change = difference(foot), difference(along)
     squared = jnp.sum(change * change)
-    moves = seen & (squared > 1e2 * float(jnp.finfo(rays.dtype).eps) ** 2)
+    moves = determined & (squared > 1e2 * float(jnp.finfo(rays.dtype).eps) ** 2)
     half, rest = jnp.sum(base * change), jnp.sum(base * base) - jnp.sum(across * across)
     discriminant = half * half - squared * rest
     real = moves & (discriminant >= 0) & (jnp.sum(across * across) > 0)
@@ -71,15 +71,15 @@ def upright_p2p(rays: Float[Array, "2 3"], points_world: Float[Array, "2 3"]) ->
         valid = real & jnp.all(distances > 0)
         distances = jnp.where(valid, distances, 1.0)
         turn = _turn_between(difference(distances), across, valid)
-        seen_points = jnp.sum(turn * (distances[0] * rays[0])[None, :], axis=1)
-        return SE3(SO3(turn), jnp.where(valid, points_world[0] - seen_points, 0.0)), valid
+        determined_points = jnp.sum(turn * (distances[0] * rays[0])[None, :], axis=1)
+        return SE3(SO3(turn), jnp.where(valid, points_world[0] - determined_points, 0.0)), valid
 
     poses, valid = jax.vmap(pose)(jnp.array([1.0, -1.0], rays.dtype))
     return MinimalPoses(poses, valid & (jnp.array([True, False]) | (root > 0)))
 
 
 def _turn_between(inner: Float[Array, "2"], outer: Float[Array, "2"], valid: Bool[Array, ""]) -> Float[Array, "3 3"]:
-    """Rotation about y that turns the horizontal (x, z) vector ``inner`` onto ``outer``."""
+    """Rotation about y that maps the direction of the horizontal (x, z) vector ``inner`` to that of ``outer``."""
     cos = inner[0] * outer[0] + inner[1] * outer[1]
     sin = inner[1] * outer[0] - inner[0] * outer[1]
     squared = cos * cos + sin * sin
@@ -96,7 +96,7 @@ def _about_y(cos: Float[Array, ""], sin: Float[Array, ""]) -> Float[Array, "3 3"
 
 @eqx.filter_jit
 def upright_relative(first: Float[Array, "3 3"], second: Float[Array, "3 3"]) -> MinimalPoses:
-    """Relative poses of two level cameras that see the same three points: up to four, translations of unit length.
+    """Relative poses of two level cameras from three correspondences: up to four, translations of unit length.
 
     ``t . (R(a) y_i x x_i) = 0`` for three pairs of rays says that a 3x3 matrix is singular. Its determinant is a
     trigonometric polynomial of degree two in the angle a, known from five values; its zeros are those of a quartic.
@@ -106,8 +106,8 @@ def upright_relative(first: Float[Array, "3 3"], second: Float[Array, "3 3"]) ->
         second: of the same points in the second.
 
     Returns:
-        Four candidates ``T_first_second``; `valid` marks solutions with all points ahead along their rays, each once.
-        Everything stays finite.
+        Four candidates ``T_first_second``; `valid` marks distinct solutions with all points in front of the cameras.
+        All values are finite.
 
     References:
         Fraundorfer, Tanskanen, Pollefeys, "A minimal case solution to the calibrated relative pose problem for the case
@@ -135,20 +135,20 @@ def upright_relative(first: Float[Array, "3 3"], second: Float[Array, "3 3"]) ->
         steep = real & (jnp.abs(lax.stop_gradient(value)) <= tolerance) & (slope != 0)
         angle = angle - jnp.where(steep, value / jnp.where(slope != 0, slope, 1.0), 0.0)
         turn = _about_y(jnp.cos(angle), jnp.sin(angle))
-        turned = jnp.sum(turn[None] * second[:, None, :], axis=2)
-        rows = jnp.cross(turned, first)
-        direction, known = null_vector(rows)
-        apart = jnp.max(jnp.abs(rows)) > 10.0 * float(jnp.finfo(rows.dtype).eps)
-        signs = depth_signs(direction, first, turned)
-        ahead, behind = jnp.all(signs > 0), jnp.all(signs < 0)
-        return SE3(SO3(turn), jnp.where(behind, -direction, direction)), steep & known & apart & (ahead | behind)
+        rotated = jnp.sum(turn[None] * second[:, None, :], axis=2)
+        rows = jnp.cross(rotated, first)
+        direction, unique = null_vector(rows)
+        distinct = jnp.max(jnp.abs(rows)) > 10.0 * float(jnp.finfo(rows.dtype).eps)
+        signs = depth_signs(direction, first, rotated)
+        in_front, behind = jnp.all(signs > 0), jnp.all(signs < 0)
+        return SE3(SO3(turn), jnp.where(behind, -direction, direction)), steep & unique & distinct & (in_front | behind)
 
     poses, valid = jax.vmap(pose)(angles, real)
-    return MinimalPoses(poses, valid & _once(angles, valid))
+    return MinimalPoses(poses, valid & _is_first(angles, valid))
 
 
 def _rows(first: Array, second: Array, turn: Array) -> Float[Array, "3 3"]:
-    """Normals of the epipolar planes: all are at right angles to the translation."""
+    """Normals of the epipolar planes, all orthogonal to the translation."""
     return jnp.cross(jnp.sum(turn[None] * second[:, None, :], axis=2), first)
 
 
@@ -174,7 +174,7 @@ def _value_and_slope(waves: Float[Array, "5"], angle: Array) -> tuple[Array, Arr
 def _zeros(waves: Float[Array, "5"]) -> tuple[Float[Array, "4"], Bool[Array, "4"]]:
     """Angles where the trigonometric polynomial is zero, and which are real.
 
-    Half of the angle's tangent turns it into a quartic. Where the determinant is largest is put at a half turn, so that
+    The tangent of half the angle makes it a quartic. The largest determinant is moved to a half turn, so that
     the leading coefficient is not small.
     """
     samples = jnp.arange(8, dtype=waves.dtype) * (jnp.pi / 4.0)
@@ -200,7 +200,7 @@ def _zeros(waves: Float[Array, "5"]) -> tuple[Float[Array, "4"], Bool[Array, "4"
 def _quartic(a: Array, b: Array, c: Array, d: Array) -> tuple[Float[Array, "4"], Bool[Array, "4"]]:
     """Roots of ``x^4 + a x^3 + b x^2 + c x + d`` by Descartes' two quadratics, and which are real.
 
-    A complex pair that is nearly real counts as a double root: what follows tests every root.
+    A complex pair that is nearly real counts as a double root; all roots are tested later.
     """
     shift = 0.25 * a
     p = b - 6.0 * shift**2
@@ -237,9 +237,9 @@ def _largest_root(a: Array, b: Array, c: Array) -> Array:
     return jnp.where(discriminant > 0, single, 2.0 * radius * jnp.cos(jnp.arccos(ratio) / 3.0)) - shift
 
 
-def _once(angles: Float[Array, "4"], valid: Bool[Array, "4"]) -> Bool[Array, "4"]:
-    """False for what repeats an earlier valid angle."""
+def _is_first(angles: Float[Array, "4"], valid: Bool[Array, "4"]) -> Bool[Array, "4"]:
+    """False for angles that repeat an earlier valid one."""
     near = float(jnp.finfo(angles.dtype).eps) ** 0.5
-    apart = jnp.abs(jnp.sin(0.5 * (angles[:, None] - angles[None, :])))
+    difference = jnp.abs(jnp.sin(0.5 * (angles[:, None] - angles[None, :])))
     index = jnp.arange(4)
-    return ~jnp.any((apart < near) & valid[None, :] & (index[None, :] < index[:, None]), axis=1)
+    return ~jnp.any((difference < near) & valid[None, :] & (index[None, :] < index[:, None]), axis=1)

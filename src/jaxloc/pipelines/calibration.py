@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float64
 
 from jaxloc.multiview.rectification import Rectification, rectify
 from jaxloc.refinement.calibration import (
+    BrownConradyModel,
     Corners,
     Fisheye,
-    Glass,
     Intrinsics,
     Parameters,
     board_errors,
@@ -50,7 +50,7 @@ class Config(eqx.Module):
 
     def intrinsics(self) -> Intrinsics:
         """The parameters that are estimated."""
-        lens = Fisheye(self.radial) if self.fisheye else Glass(self.radial, self.tangential)
+        lens = Fisheye(self.radial) if self.fisheye else BrownConradyModel(self.radial, self.tangential)
         return Intrinsics(lens, self.square_pixels, self.principal_point)
 
 

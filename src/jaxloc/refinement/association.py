@@ -1,13 +1,12 @@
-"""Which feature of the map is which in the image: attributes, a pose, and what the others say.
+"""Data association of features with a map: attributes, predicted pose, ambiguity, consensus and robust fitting.
 
-Without knowledge n features can be matched in n! ways. Five sources of information cut that down (Kelly's list), each a
-record that can be left out:
+n features can be matched in n! ways. Five sources of information reduce that (Kelly's list), each an optional record:
 
 - *richness*: attributes such as a barcode, a block of pixels, the eigenvalues of a corner, a curvature;
-- *pose*: a predicted place with its covariance: gate and cost by Mahalanobis distance;
-- *separation*: a pair with a rival that is about as good is ambiguous, and better left out;
-- *consensus*: distances between features are the same in both frames, so right pairs support one another;
-- *conditioning*: some wrong pairs may be among the rest: a robust pose is fitted, and what departs from it left out.
+- *pose*: a predicted position with covariance: gate and cost by Mahalanobis distance;
+- *separation*: a pair with an alternative of about the same cost is ambiguous, and removed;
+- *consensus*: distances between features are the same in both frames, so that correct pairs support each other;
+- *conditioning*: outliers of a robust pose that is fitted to the remaining pairs are removed.
 
 References:
     A. Kelly, *Mobile Robotics*, lecture 9.2.3.3 and 9.2.3.5 [K-55, K-58, K-59].
@@ -69,7 +68,7 @@ class Features(eqx.Module):
 
 
 class Richness(eqx.Module):
-    """Attributes count: gated each by itself, and added to the cost.
+    """Use of attributes: each is gated, and added to the cost.
 
     Attributes:
         gate: greatest squared distance in sigmas of one attribute.
@@ -79,7 +78,7 @@ class Richness(eqx.Module):
 
 
 class PoseGate(eqx.Module):
-    """The predicted pose counts, with its covariance.
+    """Use of the predicted pose with its covariance.
 
     Attributes:
         gate: greatest squared Mahalanobis distance.
@@ -89,21 +88,21 @@ class PoseGate(eqx.Module):
 
 
 class Separation(eqx.Module):
-    """Pairs with a rival in their row or column are left out.
+    """Removal of ambiguous pairs, with an alternative in their row or column.
 
     Attributes:
-        margin: by which the cost of the rival has to be greater.
+        margin: least excess of the cost of the alternative.
     """
 
     margin: float = 4.0
 
 
 class PairConsensus(eqx.Module):
-    """Pairs that few others agree with cost more.
+    """Additional cost of pairs with little support by other pairs.
 
     Attributes:
         sigma: standard deviation of a distance between two features, m; None takes that of the points.
-        weight: cost of a pair that nobody supports.
+        weight: cost of a pair without any support.
     """
 
     sigma: float | None = None
@@ -111,11 +110,11 @@ class PairConsensus(eqx.Module):
 
 
 class Conditioning(eqx.Module):
-    """A robust pose is fitted to the pairs, and those that depart from it are left out.
+    """Removal of outliers of a robust pose that is fitted to the pairs.
 
     Attributes:
         scale: of the robust kernel, sigmas.
-        gate: greatest distance from where the fitted pose has a feature, sigmas.
+        gate: greatest distance under the fitted pose, sigmas.
     """
 
     scale: float = 3.0
@@ -123,7 +122,7 @@ class Conditioning(eqx.Module):
 
 
 class Sources(eqx.Module):
-    """Which of the five sources of information are used; None leaves one out [K-59]."""
+    """The five sources of information; None disables one [K-59]."""
 
     richness: Richness | None = Richness()
     pose: PoseGate | None = PoseGate()
@@ -133,7 +132,7 @@ class Sources(eqx.Module):
 
 
 class Costs(eqx.Module):
-    """What pairs cost.
+    """Costs of all pairs.
 
     Attributes:
         values: in units of a squared sigma; zero where not feasible.
@@ -145,12 +144,12 @@ class Costs(eqx.Module):
 
 
 class Association(eqx.Module):
-    """Which map feature each seen feature is.
+    """Association of observed features with map features.
 
     Attributes:
         columns: index of the map feature, -1 for none.
         costs: of all pairs.
-        total: cost of the assignment before pairs were left out.
+        total: cost of the assignment before pairs were removed.
     """
 
     columns: Int[Array, " n"]
@@ -160,18 +159,18 @@ class Association(eqx.Module):
 
 @eqx.filter_jit
 def pair_costs(
-    pose: Gaussian, seen: Features, known: Features, *, sources: Sources = Sources(), sigma: Any = 0.05
+    pose: Gaussian, observed: Features, known: Features, *, sources: Sources = Sources(), sigma: Any = 0.05
 ) -> Costs:
-    """Composite cost of each pair of a seen and a known feature, and which pairs are possible at all.
+    """Composite costs of pairs of an observed and a map feature, and which pairs are feasible.
 
-    Sum of the squared Mahalanobis distance of the places, with covariance ``J P J^T + sigma^2``, and of the squared
-    distances of the attributes, each within its gate; with consensus, what is lacking of support by other pairs.
+    Sum of the squared Mahalanobis distance of the positions, with covariance ``J P J^T + sigma^2``, and of the squared
+    distances of the attributes, each within its gate; with consensus, the lack of support by other pairs.
 
     Args:
         pose: of the sensor on the map, ``T_map_sensor``, `SE2` or `SE3`, with its covariance.
-        seen: features in the frame of the sensor.
+        observed: features in the frame of the sensor.
         known: features of the map.
-        sources: of information that are used; separation and conditioning have no part in costs.
+        sources: of information that are used; separation and conditioning do not enter costs.
         sigma: standard deviation of a coordinate of the difference, m.
 
     Returns:
@@ -183,38 +182,40 @@ def pair_costs(
     References:
         KELLY 9.2.3.5 [K-55, K-58, K-59].
     """
-    kinds = [[type(attribute) for attribute in side.attributes] for side in (seen, known)]
+    kinds = [[type(attribute) for attribute in side.attributes] for side in (observed, known)]
     if kinds[0] != kinds[1]:
-        raise ValueError(f"Seen features have the attributes {kinds[0]}, known ones {kinds[1]}: give the same.")
-    usable = seen.usable(), known.usable()
-    here, there = (jnp.where(u[:, None], f.points, 0.0) for u, f in zip(usable, (seen, known), strict=True))
+        raise ValueError(
+            f"The observed features have the attributes {kinds[0]}, the map's features {kinds[1]}: give the same."
+        )
+    usable = observed.usable(), known.usable()
+    here, there = (jnp.where(u[:, None], f.points, 0.0) for u, f in zip(usable, (observed, known), strict=True))
     feasible = usable[0][:, None] & usable[1][None, :]
     values = jnp.zeros(feasible.shape, here.dtype)
     if sources.pose is not None:
         squared = _mahalanobis(pose, here, there, sigma)
         values, feasible = values + squared, feasible & (squared <= sources.pose.gate)
     if sources.richness is not None:
-        for mine, theirs in zip(seen.attributes, known.attributes, strict=True):
+        for mine, theirs in zip(observed.attributes, known.attributes, strict=True):
             squared = mine.squared_distance(theirs).astype(here.dtype)
             close = squared <= sources.richness.gate  # false for nan
             values, feasible = values + jnp.where(close, squared, 0.0), feasible & close
     values = jnp.where(feasible, values, 0.0)
     if sources.consensus is not None:
-        values = values + _lacking_support(sources.consensus, here, there, feasible, sigma)
+        values = values + _support_cost(sources.consensus, here, there, feasible, sigma)
     return Costs(jnp.where(feasible, values, 0.0), feasible)
 
 
 @eqx.filter_jit
 def associate(
-    pose: Gaussian, seen: Features, known: Features, *, sources: Sources = Sources(), sigma: Any = 0.05
+    pose: Gaussian, observed: Features, known: Features, *, sources: Sources = Sources(), sigma: Any = 0.05
 ) -> Association:
-    """The best one-to-one association of seen features with known ones.
+    """Optimal one-to-one association of observed features with map features.
 
-    As many possible pairs as there can be, at the least total cost; then ambiguous and departing pairs are left out.
+    The largest number of feasible pairs at the least total cost; then ambiguous pairs and outliers are removed.
 
     Args:
         pose: of the sensor on the map, ``T_map_sensor``, with its covariance.
-        seen: features in the frame of the sensor.
+        observed: features in the frame of the sensor.
         known: features of the map.
         sources: of information that are used.
         sigma: standard deviation of a coordinate of the difference, m.
@@ -230,78 +231,78 @@ def associate(
         >>> from jaxloc.refinement.association import Features, Identity, associate
         >>> pose = jl.beliefs.Gaussian(jl.poses.SE2(0.0, 0.0, 0.0), jnp.eye(3) * 0.01)
         >>> known = Features(jnp.array([[1.0, 0.0], [1.1, 0.0]]), (Identity(jnp.array([7, 8])),))
-        >>> seen = Features(jnp.array([[1.05, 0.0], [1.05, 0.1]]), (Identity(jnp.array([8, 7])),))
-        >>> associate(pose, seen, known).columns.tolist()
+        >>> observed = Features(jnp.array([[1.05, 0.0], [1.05, 0.1]]), (Identity(jnp.array([8, 7])),))
+        >>> associate(pose, observed, known).columns.tolist()
         [1, 0]
     """
-    costs = pair_costs(pose, seen, known, sources=sources, sigma=sigma)
+    costs = pair_costs(pose, observed, known, sources=sources, sigma=sigma)
     best = assign(costs.values, costs.feasible)
     columns = best.columns
     if sources.separation is not None:
         columns = _unambiguous(columns, costs, sources.separation)
     if sources.conditioning is not None:
-        columns = _agreeing(columns, pose.mean, seen, known, sources.conditioning, sigma)
+        columns = _inliers(columns, pose.mean, observed, known, sources.conditioning, sigma)
     return Association(columns, costs, best.cost)
 
 
-def _mahalanobis(pose: Gaussian, seen: Array, known: Array, sigma: Any) -> Float[Array, "n m"]:
-    """Squared distances of predicted places from known ones, by the covariance of each prediction."""
+def _mahalanobis(pose: Gaussian, observed: Array, known: Array, sigma: Any) -> Float[Array, "n m"]:
+    """Squared Mahalanobis distances of predicted positions from those of the map."""
     mean: SE2 | SE3 = pose.mean
-    linear = PointPoint(seen, seen).linearize(mean)
-    predicted = mean.apply(seen)
-    eye = jnp.eye(seen.shape[1], dtype=seen.dtype)
+    linear = PointPoint(observed, observed).linearize(mean)
+    predicted = mean.apply(observed)
+    eye = jnp.eye(observed.shape[1], dtype=observed.dtype)
 
     def one(place: Array, slope: Float[Array, "d k"]) -> Float[Array, " m"]:
-        spread = matmul(slope.T, matmul(pose.covariance, slope)) + jnp.asarray(sigma, seen.dtype) ** 2 * eye
+        covariance = matmul(slope.T, matmul(pose.covariance, slope)) + jnp.asarray(sigma, observed.dtype) ** 2 * eye
         gaps = known - place[None, :]
-        return jnp.sum(gaps * matmul(gaps, factor(spread).inverse()), axis=1)
+        return jnp.sum(gaps * matmul(gaps, factor(covariance).inverse()), axis=1)
 
     return jax.vmap(one)(predicted, jnp.moveaxis(linear.jacobian, -1, 0))
 
 
-def _lacking_support(
-    consensus: PairConsensus, seen: Array, known: Array, feasible: Bool[Array, "n m"], sigma: Any
+def _support_cost(
+    consensus: PairConsensus, observed: Array, known: Array, feasible: Bool[Array, "n m"], sigma: Any
 ) -> Float[Array, "n m"]:
     """Cost of a pair (i, j): the part of the other features k that have no l with ``|x_i - x_k| = |y_j - y_l|``."""
-    spread = jnp.asarray(2.0 * sigma if consensus.sigma is None else consensus.sigma, seen.dtype)
-    inside, outside = (_distances(points) for points in (seen, known))
-    alone = jnp.any(feasible, axis=1)
-    count = jnp.maximum(jnp.sum(alone) - 1, 1).astype(seen.dtype)
+    deviation = jnp.asarray(2.0 * sigma if consensus.sigma is None else consensus.sigma, observed.dtype)
+    inside, outside = (_distances(points) for points in (observed, known))
+    feasible_rows = jnp.any(feasible, axis=1)
+    count = jnp.maximum(jnp.sum(feasible_rows) - 1, 1).astype(observed.dtype)
 
     def row(index: Int[Array, ""]) -> Float[Array, " m"]:
-        # "k j l": how well the distance to k is that from j to l.
-        gap = (inside[index][:, None, None] - outside[None, :, :]) / spread
-        likeness = jnp.where(feasible[:, None, :], jnp.exp(-0.5 * gap * gap), 0.0)
-        others = (jnp.arange(seen.shape[0]) != index)[:, None]
-        return jnp.sum(jnp.where(others, jnp.max(likeness, axis=2), 0.0), axis=0) / count
+        # "k j l": agreement of the distance to k with that from j to l.
+        gap = (inside[index][:, None, None] - outside[None, :, :]) / deviation
+        agreement = jnp.where(feasible[:, None, :], jnp.exp(-0.5 * gap * gap), 0.0)
+        others = (jnp.arange(observed.shape[0]) != index)[:, None]
+        return jnp.sum(jnp.where(others, jnp.max(agreement, axis=2), 0.0), axis=0) / count
 
-    support = lax.map(row, jnp.arange(seen.shape[0]))
+    support = lax.map(row, jnp.arange(observed.shape[0]))
     return consensus.weight * (1.0 - jnp.clip(support, 0.0, 1.0))
 
 
 def _unambiguous(columns: Int[Array, " n"], costs: Costs, separation: Separation) -> Int[Array, " n"]:
-    """Without pairs that have a rival within the margin, in their row or in their column."""
+    """Removes pairs with an alternative within the margin, in their row or in their column."""
     safe = jnp.where(costs.feasible, costs.values, jnp.inf)
-    taken = columns >= 0
-    place = jnp.where(taken, columns, 0)
+    paired = columns >= 0
+    place = jnp.where(paired, columns, 0)
     own = jnp.take_along_axis(safe, place[:, None], axis=1)[:, 0]
     rows, width = jnp.arange(safe.shape[0]), safe.shape[1]
     in_row = jnp.min(jnp.where(jnp.arange(width)[None, :] == place[:, None], jnp.inf, safe), axis=1)
     by_column = safe[:, place].T
     in_column = jnp.min(jnp.where(rows[None, :] == rows[:, None], jnp.inf, by_column), axis=1)
-    apart = jnp.minimum(in_row, in_column) - jnp.where(taken, own, 0.0) >= separation.margin
-    return jnp.where(taken & apart, columns, -1)
+    distinct = jnp.minimum(in_row, in_column) - jnp.where(paired, own, 0.0) >= separation.margin
+    return jnp.where(paired & distinct, columns, -1)
 
 
-def _agreeing(
-    columns: Int[Array, " n"], pose: SE2 | SE3, seen: Features, known: Features, rule: Conditioning, sigma: Any
+def _inliers(
+    columns: Int[Array, " n"], pose: SE2 | SE3, observed: Features, known: Features, rule: Conditioning, sigma: Any
 ) -> Int[Array, " n"]:
-    """Without pairs that a robust fit of the pose leaves far apart; all of them where no pose can be fitted."""
-    taken = columns >= 0
-    partners = known.points[jnp.where(taken, columns, 0)]
-    pairs = PointPoint(seen.points, partners, sigma=sigma, valid=taken)
+    """Removes outliers of a robust fit of the pose; keeps all where no pose can be fitted."""
+    paired = columns >= 0
+    partners = known.points[jnp.where(paired, columns, 0)]
+    pairs = PointPoint(observed.points, partners, sigma=sigma, valid=paired)
     fit = refine(Correspondences(pairs), pose, loss=GemanMcClure(rule.scale))
-    gaps = jnp.where(taken[:, None], fit.value.apply(jnp.where(taken[:, None], seen.points, 0.0)) - partners, 0.0)
+    gaps = jnp.where(paired[:, None], fit.value.apply(jnp.where(paired[:, None], observed.points, 0.0)) - partners, 0.0)
     near = jnp.sum(gaps**2, axis=1) <= (rule.gate * jnp.asarray(sigma, gaps.dtype)) ** 2
     return jnp.where(near | ~fit.ok, columns, -1)
 

@@ -1,4 +1,4 @@
-"""What features keep from view to view, and how far apart two of them are by it [K-55].
+"""View-invariant attributes of features, and distances between them [K-55].
 
 Kelly's list: an identity such as a barcode, a block of pixels, the eigenvalues of a corner, a curvature.
 
@@ -17,15 +17,15 @@ from jaxloc._linalg import matmul
 
 
 class Attribute(eqx.Module):
-    """Something that a feature keeps from view to view, one a feature."""
+    """View-invariant attribute, one a feature."""
 
     @abstractmethod
     def squared_distance(self, other: Any) -> Float[Array, "n m"]:
-        """Squared distances in sigmas to the attributes of other features; infinite where they cannot be the same."""
+        """Squared distances in sigmas to the attributes of other features; infinite for incompatible ones."""
 
 
 class Identity(Attribute):
-    """A number that is read: a barcode, a radio tag. Negative where it could not be read: then it tells nothing.
+    """An identity that is read, as of a barcode or a radio tag; negative where unread, which matches anything.
 
     Attributes:
         codes: one a feature.
@@ -57,7 +57,7 @@ class Blocks(Attribute):
 
 
 class CornerStrength(Attribute):
-    """Eigenvalues of the structure tensor: their logarithms, so that exposure matters little.
+    """Eigenvalues of the structure tensor, compared by logarithms to reduce the effect of exposure.
 
     Attributes:
         eigenvalues: "n 2", positive, in one order.

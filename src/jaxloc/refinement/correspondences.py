@@ -1,19 +1,19 @@
-"""Poses from matched features of every kind: points, lines and segments, in the plane and in space, in one problem.
+"""Pose estimation from mixed correspondences of points, lines and segments, in the plane and in space.
 
-Features of a source frame are brought to the target frame by ``T = T_target_source`` and compared with their partners
-there. Each kind of pair leaves a difference vector, of which some directions count:
+Features of a source frame are mapped to the target frame by ``T = T_target_source`` and compared with their matches
+there. Each kind of pair has a difference vector, some directions of which are used:
 
-| pair | what is compared | cost dofs in the plane | in space |
+| pair | residual | dofs in the plane | in space |
 |---|---|---|---|
 | point to point | all of ``T s - t`` | 2 | 3 |
 | point to line | the part of ``T s - p`` across the line | 1 | 2 |
-| point to segment | the way to the nearest point, ends included | 1 (2 beyond an end) | 2 (3) |
+| point to segment | vector to the nearest point, ends included | 1 (2 beyond an end) | 2 (3) |
 | segment to segment | both ends of the source across the target's line | 2 | 4 |
 | line to line | the sine of the angle between the directions | 1 | 2 |
 
-Segments are cut where a detector lost them, so their ends tell nothing along them: what is left in the plane is the
-distance across and the angle, two dofs. Lines without ends tell the angle; where the place of a line is known too, any
-of its points is a point-to-line pair. Ends that are known are point-to-point pairs.
+Detected segments end at arbitrary points, so their ends give no constraint along them: in the plane the distance across
+and the angle remain, two dofs. Lines without ends constrain the angle; where the position of a line is known too, any
+of its points is a point-to-line pair. Known end points are point-to-point pairs.
 
 References:
     A. Kelly, *Mobile Robotics*, lecture 9.2.3.4, four kinds of planar correspondences [K-56, K-57]; 9.2.3.7 for the
@@ -70,7 +70,7 @@ class Correspondences(eqx.Module):
     line_line: LineLine | None = None
 
     def kinds(self) -> tuple[Pairs, ...]:
-        """Those that are there, in the order of the fields.
+        """The kinds that are present, in the order of the fields.
 
         Raises:
             ValueError: there are none.
@@ -83,7 +83,7 @@ class Correspondences(eqx.Module):
 
 
 class Mixed(Problem):
-    """Correspondences of all kinds at once; the state is the pose ``T_target_source``, `SE2` or `SE3` [K-57].
+    """Least-squares problem of mixed correspondences; the state is the pose ``T_target_source``, `SE2` or `SE3` [K-57].
 
     Attributes:
         correspondences: the pairs.
@@ -111,25 +111,25 @@ def refine(
     loss: Any = Quadratic(),
     solver: Solver = LevenbergMarquardt(),
 ) -> Estimate:
-    """The pose that brings features of a source frame onto their partners.
+    """Pose that maps features of a source frame onto their matches in a target frame.
 
     Minimizes ``sum rho(|r_k(T)|^2)`` over ``T = T_target_source`` with the whitened differences of all pairs.
 
     Args:
-        correspondences: pairs of any kinds; numbers of pairs that do not count, nan too, have no influence.
-        initial: guess of ``T_target_source``: `SE2` for features of the plane, `SE3` for those of space.
+        correspondences: pairs of any kinds; masked pairs may hold any numbers, nan too.
+        initial: ``T_target_source``: `SE2` for features of the plane, `SE3` for those of space.
         loss: robust kernel, or one for each kind present.
-        solver: how to minimize.
+        solver: of the minimization.
 
     Returns:
-        Estimate of the pose, covariance in its tangent. ``ok`` is False when the pairs leave a direction open, as
-        lines do that are all parallel.
+        Estimate of the pose, covariance in its tangent. ``ok`` is False when the pairs do not determine it, as lines
+        that are all parallel.
 
     Raises:
         ValueError: no pairs, or features and pose of different dimension.
 
     References:
-        KELLY 9.2.3.4, 9.2.4.2 [K-57, K-73]. Source and target change places by the inverse pose [K-15].
+        KELLY 9.2.3.4, 9.2.4.2 [K-57, K-73]. Source and target are exchanged by the inverse pose [K-15].
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl

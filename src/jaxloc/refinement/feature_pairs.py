@@ -1,6 +1,6 @@
-"""Pairs of matched features, one kind a record: how far they are apart, and how that moves with the pose.
+"""Pairs of matched features, one record a kind: whitened differences and their derivatives by the pose.
 
-What counts of a difference is explained in `correspondences` [K-57].
+The residuals are described in `correspondences` [K-57].
 """
 
 from abc import abstractmethod
@@ -19,7 +19,7 @@ class Pairs(eqx.Module):
     """Pairs of one kind; points and directions are kept as "k n", items along the last axis.
 
     Attributes:
-        whitening: one over the standard deviation; zero for pairs that do not count.
+        whitening: one over the standard deviation; zero for masked pairs.
     """
 
     whitening: eqx.AbstractVar[Float[Array, " n"]]
@@ -30,13 +30,13 @@ class Pairs(eqx.Module):
 
 
 class PointPoint(Pairs):
-    """Points and their partners: ``T s - t``.
+    """Point-to-point pairs: ``T s - t``.
 
     Args:
         source: "n k", m.
         target: "n k", m.
         sigma: standard deviation of a coordinate of the difference, m: a number or one a pair.
-        valid: pairs that count.
+        valid: pairs that are used.
     """
 
     source: Float[Array, "k n"]
@@ -47,20 +47,20 @@ class PointPoint(Pairs):
         self.source, self.target, self.whitening = _packed((source, target), sigma, valid)
 
     def linearize(self, pose: SE2 | SE3) -> Linearization:
-        """All of the difference counts."""
+        """The whole difference."""
         difference, slope = _moved(pose, self.source)
         return _whitened(difference - self.target, slope, self.whitening)
 
 
 class PointLine(Pairs):
-    """Points and lines without ends: the part of ``T s - p`` across the line.
+    """Point-to-line pairs: the part of ``T s - p`` across the line.
 
     Args:
         source: "n k", m.
         target: a point of each line, "n k", m.
         direction: along each line, "n k", of any length but zero.
         sigma: standard deviation of the distance, m: a number or one a pair.
-        valid: pairs that count; lines without direction never do.
+        valid: pairs that are used; lines without direction never are.
     """
 
     source: Float[Array, "k n"]
@@ -73,21 +73,21 @@ class PointLine(Pairs):
         self.direction, self.whitening = _unit(along, whitening)
 
     def linearize(self, pose: SE2 | SE3) -> Linearization:
-        """What lies across the line counts."""
+        """The part across the line."""
         moved, slope = _moved(pose, self.source)
         difference, slope = _across(self.direction, moved - self.target, slope)
         return _whitened(difference, slope, self.whitening)
 
 
 class PointSegment(Pairs):
-    """Points and segments: the way from the nearest point of the segment, which may be one of its ends [K-63].
+    """Point-to-segment pairs: the vector from the nearest point of the segment, which may be an end [K-63].
 
     Args:
         source: "n k", m.
         first: one end of each segment, "n k", m.
         second: the other; where it equals the first, the segment is a point.
         sigma: standard deviation of the distance, m: a number or one a pair.
-        valid: pairs that count.
+        valid: pairs that are used.
     """
 
     source: Float[Array, "k n"]
@@ -99,7 +99,7 @@ class PointSegment(Pairs):
         self.source, self.first, self.second, self.whitening = _packed((source, first, second), sigma, valid)
 
     def linearize(self, pose: SE2 | SE3) -> Linearization:
-        """Between the ends what lies across counts, beyond them everything."""
+        """The part across the segment between its ends, the whole difference beyond them."""
         moved, slope = _moved(pose, self.source)
         along, fraction = _fraction(moved, self.first, self.second)
         clamped = jnp.clip(fraction, 0.0, 1.0)
@@ -112,7 +112,7 @@ class PointSegment(Pairs):
 
 
 class SegmentSegment(Pairs):
-    """Segments and segments: how far both ends of the source lie across the line of the target.
+    """Segment-to-segment pairs: distances of both ends of the source from the line of the target.
 
     Args:
         source_first: one end of each source segment, "n k", m.
@@ -120,7 +120,7 @@ class SegmentSegment(Pairs):
         target_first: one end of each target segment, "n k", m.
         target_second: the other; the order of ends has no influence.
         sigma: standard deviation of the distance of an end, m: a number or one a pair.
-        valid: pairs that count; targets without length never do.
+        valid: pairs that are used; targets without length never are.
     """
 
     first: Float[Array, "k n"]
@@ -144,7 +144,7 @@ class SegmentSegment(Pairs):
         self.direction, self.whitening = _unit(other - self.target, whitening)
 
     def linearize(self, pose: SE2 | SE3) -> Linearization:
-        """Two distances across."""
+        """Both distances."""
         parts = []
         for end in (self.first, self.second):
             moved, slope = _moved(pose, end)
@@ -155,13 +155,13 @@ class SegmentSegment(Pairs):
 
 
 class LineLine(Pairs):
-    """Lines without ends: ``R d_s`` across ``d_t``, the sine of the angle between them; signs have no influence.
+    """Line-to-line pairs: ``R d_s`` across ``d_t``, the sine of the angle between them, for either sign.
 
     Args:
         source: directions in the source frame, "n k", of any length but zero.
         target: directions in the target frame.
         sigma: standard deviation of the angle, rad: a number or one a pair.
-        valid: pairs that count; lines without direction never do.
+        valid: pairs that are used; lines without direction never are.
     """
 
     source: Float[Array, "k n"]
@@ -174,12 +174,12 @@ class LineLine(Pairs):
         self.target, self.whitening = _unit(target, whitening)
 
     def linearize(self, pose: SE2 | SE3) -> Linearization:
-        """The direction's part across."""
+        """The part of the direction across."""
         moved, slope = _moved(pose, self.source)
         size = self.source.shape[0]
-        turned = moved - pose.translation[:, None]
-        # Directions turn, but do not shift.
-        difference, slope = _across(self.target, turned, slope.at[:size].set(0.0))
+        rotated = moved - pose.translation[:, None]
+        # Directions do not depend on translation.
+        difference, slope = _across(self.target, rotated, slope.at[:size].set(0.0))
         return _whitened(difference, slope, self.whitening)
 
 
@@ -187,7 +187,7 @@ class LineLine(Pairs):
 def nearest_on_segment(
     points: Float[Array, "n k"], first: Float[Array, "n k"], second: Float[Array, "n k"]
 ) -> Float[Array, "n k"]:
-    """The point of each segment, its ends included, that is nearest to a point.
+    """Nearest point of each segment, its ends included, to a point.
 
     ``a + clip(v1 . v2 / v2 . v2, 0, 1) v2`` with ``v1 = x - a`` and ``v2 = b - a``. The lecture tests one end only.
 
@@ -213,7 +213,7 @@ def nearest_on_segment(
 
 
 def _packed(features: tuple[Array, ...], sigma: Any, valid: Bool[Array, " n"] | None) -> tuple[Array, ...]:
-    """Features as "k n" with bad numbers replaced, and the whitening, zero for pairs that do not count."""
+    """Features as "k n" with non-finite values replaced, and the whitening, zero for masked pairs."""
     shapes = {feature.shape for feature in features}
     if len(shapes) > 1 or len(features[0].shape) != 2 or features[0].shape[1] not in {2, 3}:
         raise ValueError(f"Features of a pair have one shape, (n, 2) or (n, 3); these have {sorted(shapes)}.")
@@ -238,7 +238,7 @@ def _unit(
 
 
 def _moved(pose: SE2 | SE3, points: Float[Array, "k n"]) -> tuple[Float[Array, "k n"], Float[Array, "d k n"]]:
-    """Points in the target frame, and how they move with ``T exp(v, w)``: by ``R (v + w x s)``."""
+    """Points in the target frame, and their derivatives by ``T exp(v, w)``, ``R (v + w x s)``."""
     rotation = pose.rotation.matrix()
     size, count = points.shape
     shifts = jnp.broadcast_to(rotation.T[:, :, None], (size, size, count))
@@ -248,8 +248,8 @@ def _moved(pose: SE2 | SE3, points: Float[Array, "k n"]) -> tuple[Float[Array, "
     else:
         x, y, z = points
         turns = [jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])]
-    turned = jnp.stack([matmul(rotation, turn) for turn in turns])
-    return matmul(rotation, points) + pose.translation[:, None], jnp.concatenate([shifts, turned])
+    rotated = jnp.stack([matmul(rotation, turn) for turn in turns])
+    return matmul(rotation, points) + pose.translation[:, None], jnp.concatenate([shifts, rotated])
 
 
 def _across(
@@ -268,7 +268,7 @@ def _whitened(difference: Float[Array, "c n"], slope: Float[Array, "d c n"], whi
 def _fraction(
     points: Float[Array, "k n"], first: Float[Array, "k n"], second: Float[Array, "k n"]
 ) -> tuple[Float[Array, "k n"], Float[Array, " n"]]:
-    """The segment as a vector, and where on it a point falls: 0 at the first end, 1 at the second."""
+    """The segment as a vector, and the position of a projected point: 0 at the first end, 1 at the second."""
     along = second - first
     squared = jnp.sum(along**2, axis=0)
     some = squared > float(jnp.finfo(points.dtype).tiny)

@@ -1,6 +1,6 @@
-"""Flow of points in the image of a moving camera: the interaction matrix, and problems whose unknown is the motion.
+"""Interaction matrix of image points, and least-squares problems of camera motion from optical flow.
 
-The model is explained in `image_velocity` [K-78].
+The model is described in `motion_from_flow` [K-78].
 """
 
 from typing import Any
@@ -14,12 +14,12 @@ from jaxloc.poses import Direction
 from jaxloc.solvers import Linearization, Problem, Quadratic
 from jaxloc.solvers.cholesky import factor
 
-# Variance that depths and a translation explain over that of what is left: a few for noise alone.
+# Least ratio of the variance explained by depths and translation to the residual variance; a few for noise alone.
 _LEAST_RATIO = 8.0
 
 
 class FreeMotion(eqx.Module):
-    """How a camera moves as far as an image without depth tells.
+    """Camera motion up to scale: what flow without depth determines.
 
     Attributes:
         direction: of the translation, camera axes.
@@ -31,7 +31,7 @@ class FreeMotion(eqx.Module):
 
 
 class TwistAndDepths(eqx.Module):
-    """A twist and the inverse depths of the points that it was seen by.
+    """A twist and the inverse depths of the points.
 
     Attributes:
         twist: (v, w), camera axes.
@@ -43,12 +43,12 @@ class TwistAndDepths(eqx.Module):
 
 
 class FlowOfTwist(Problem):
-    """Flow of points of known depth; the state is the twist "6", or the rotation "3" alone where depth is infinite.
+    """Flow with known depth; the state is the twist "6", or the rotation "3" alone where depth is infinite.
 
     Attributes:
         interaction: "d 2 n", derivative of the flow by the state.
         flow: "2 n", finite.
-        whitening: one over the standard deviation of a component; zero for points that do not count.
+        whitening: one over the standard deviation of a component; zero for masked points.
         loss: robust kernel over the two components of a point.
     """
 
@@ -58,7 +58,7 @@ class FlowOfTwist(Problem):
     loss: Any = Quadratic()
 
     def residual(self, state: Float[Array, " d"]) -> Float[Array, "2 n"]:
-        """Whitened difference of predicted and seen flow."""
+        """Whitened difference of predicted and measured flow."""
         predicted = jnp.tensordot(state, self.interaction, 1, precision="highest")
         return (predicted - self.flow) * self.whitening[None, :]
 
@@ -68,9 +68,9 @@ class FlowOfTwist(Problem):
 
 
 class JointFlow(Problem):
-    """Flow of points whose depths are unknown, or known with an error; the state is `TwistAndDepths`.
+    """Flow with unknown or uncertain depths; the state is `TwistAndDepths`.
 
-    Without a `depth_whitening` above zero the state has a direction that nothing tells: the scale [K-88].
+    Without a `depth_whitening` above zero the scale is unobservable [K-88].
 
     Attributes:
         points: "2 n", normalized.
@@ -101,13 +101,13 @@ class JointFlow(Problem):
 class DirectionalFlow(Problem):
     """Flow with the depths eliminated; the state is `FreeMotion`.
 
-    A translation moves a point along the line through its own place and the focus of expansion, by an amount that its
-    depth is free to choose. What is left to compare is the part of the flow, less that of the rotation, across.
+    A translation moves a point along its line through the focus of expansion, by an amount that depends on the unknown
+    depth. The residual is the component of the flow, less that of the rotation, across this line.
 
     Attributes:
         points: "2 n", normalized.
         flow: "2 n".
-        whitening: one over the standard deviation of a component; zero for points that do not count.
+        whitening: one over the standard deviation of a component; zero for masked points.
         loss: robust kernel.
     """
 
@@ -117,11 +117,11 @@ class DirectionalFlow(Problem):
     loss: Any = Quadratic()
 
     def residual(self, state: FreeMotion) -> Float[Array, "1 n"]:
-        """Whitened flow across the way to the focus of expansion."""
+        """Whitened flow across the lines to the focus of expansion."""
         return (self._split(state.direction.vector, state.angular_velocity)[1] * self.whitening)[None, :]
 
     def linearize(self, state: FreeMotion) -> Linearization:
-        """In closed form: the derivative of the normal turns the flow along into flow across."""
+        """In closed form: the derivative of the normal multiplies the flow along the line."""
         linear, angular = flow_parts(self.points)
         along, normal, size = _normal(linear, state.direction.vector)
         left = self.flow - jnp.tensordot(state.angular_velocity, angular, 1, precision="highest")
@@ -133,7 +133,7 @@ class DirectionalFlow(Problem):
         return Linearization(self.residual(state), jacobian[:, None, :])
 
     def admissible(self, state: FreeMotion) -> Bool[Array, ""]:
-        """Whether a camera that only turns would explain the flow clearly worse, by the ratio of variances."""
+        """Whether pure rotation explains the flow clearly worse, by the ratio of variances."""
         _, across = self._split(state.direction.vector, state.angular_velocity)
         number = jnp.sum(jnp.where(self.whitening > 0, 1.0, 0.0).astype(across.dtype))
         left = jnp.sum((self.whitening * across) ** 2)
@@ -145,8 +145,8 @@ class DirectionalFlow(Problem):
         noise = left / jnp.maximum(number - 5.0, 1.0)
         return (number >= 5) & (gain > _LEAST_RATIO * (number + 2.0) * noise + rounding)
 
-    def ahead(self, state: FreeMotion) -> Float[Array, ""]:
-        """How many more points the flow puts ahead of the camera than behind it."""
+    def excess_in_front(self, state: FreeMotion) -> Float[Array, ""]:
+        """Number of points in front of the camera less the number behind it."""
         along, _ = self._split(state.direction.vector, state.angular_velocity)
         return jnp.sum(jnp.sign(along) * jnp.where(self.whitening > 0, 1.0, 0.0))
 
@@ -162,18 +162,18 @@ class DirectionalFlow(Problem):
         linear, angular = flow_parts(self.points)
         _, normal, _ = _normal(linear, direction)
         rows = jnp.sum(normal[None] * angular, axis=1) * self.whitening[None, :]
-        seen = jnp.sum(normal * self.flow, axis=0) * self.whitening
-        rotation = factor(matmul(rows, rows.T)).solve(matmul(rows, seen))
-        return rotation, jnp.sum((seen - matmul(rotation, rows)) ** 2)
+        measured = jnp.sum(normal * self.flow, axis=0) * self.whitening
+        rotation = factor(matmul(rows, rows.T)).solve(matmul(rows, measured))
+        return rotation, jnp.sum((measured - matmul(rotation, rows)) ** 2)
 
 
 @eqx.filter_jit
 def interaction_matrix(points: Float[Array, "n 2"], depth: Float[Array, " n"]) -> Float[Array, "n 2 6"]:
-    """How points of the image move with the twist of the camera: ``flow_k = L_k (v, w)``.
+    """Interaction matrix: flow of image points by the twist of the camera, ``flow_k = L_k (v, w)``.
 
     Args:
         points: normalized coordinates (x right, y down).
-        depth: along the optical axis, m; infinite for points of the horizon. Zero where it is not positive.
+        depth: along the optical axis, m; infinite for points of the horizon; zero rows where not positive.
 
     Returns:
         "n 2 6".
@@ -187,8 +187,8 @@ def interaction_matrix(points: Float[Array, "n 2"], depth: Float[Array, " n"]) -
         [[-0.5, 0.0, 0.5, 2.0, -2.0, 2.0], [0.0, -0.5, 1.0, 5.0, -2.0, -1.0]]
     """
     linear, angular = flow_parts(points.T)
-    ahead = depth > 0
-    inverse = jnp.where(ahead, 1.0 / jnp.where(ahead, depth, 1.0), 0.0)
+    positive = depth > 0
+    inverse = jnp.where(positive, 1.0 / jnp.where(positive, depth, 1.0), 0.0)
     return jnp.transpose(jnp.concatenate([linear * inverse[None, None, :], angular]), (2, 1, 0))
 
 

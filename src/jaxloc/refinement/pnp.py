@@ -1,4 +1,4 @@
-"""Perspective-n-point (PnP): the pose of a camera from pixels of known points, refined from an initial guess."""
+"""Perspective-n-point (PnP): least-squares pose of a camera from pixels of known points."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ def refine_pose(
     sigma: Any = 1.0,
     solver: Solver = GaussNewton(),
 ) -> Estimate:
-    """Pose of a camera from pixels of known points, starting at a guess (PnP refinement).
+    """Pose of a camera from pixels of known points and an initial pose (PnP refinement).
 
     Minimizes ``sum rho(|project(T^-1 X_i) - z_i|^2 / sigma^2)`` over the pose ``T = T_world_camera``.
 
@@ -32,15 +32,15 @@ def refine_pose(
         camera: intrinsics and lens.
         points_world: "n 3", world frame, m.
         pixels: "n 2" (u right, v down), px.
-        initial: guess of the camera's pose ``T_world_camera`` (camera to world; the inverse of OpenCV's rvec, tvec).
+        initial: the camera's pose ``T_world_camera`` (camera to world; the inverse of OpenCV's rvec, tvec).
         loss: robust kernel, in sigmas.
-        valid: which points count; numbers of others, nan too, have no influence.
+        valid: points that are used; others may hold any numbers, nan too.
         sigma: standard deviation of a pixel coordinate, px.
-        solver: how to minimize.
+        solver: of the minimization.
 
     Returns:
         Estimate of ``T_world_camera`` with covariance in its tangent (right perturbation: camera axes). ``ok`` is False
-        when fewer than three independent points are seen, when under plain least squares a point lies behind the
+        when fewer than three independent points are visible, when under plain least squares a point lies behind the
         camera, or when the solver did not converge.
 
     References:
@@ -62,7 +62,7 @@ def refine_pose(
 
 
 def _usable(valid: Any, first: Array, second: Array) -> tuple[Bool[Array, " n"], Array, Array]:
-    """The mask of finite items, and the items with the others replaced by zero: bad numbers stop here."""
+    """The mask of finite items, and the items with the others replaced by zero."""
     finite = jnp.all(jnp.isfinite(first), axis=1) & jnp.all(jnp.isfinite(second), axis=1)
     usable = finite if valid is None else valid & finite
     return usable, jnp.where(usable[:, None], first, 0.0), jnp.where(usable[:, None], second, 0.0)

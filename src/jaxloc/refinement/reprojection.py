@@ -1,6 +1,6 @@
-"""Reprojection residuals: where a camera should see known points, against where it sees them.
+"""Reprojection residuals of known points in a camera or a stereo rig.
 
-Points lie along the last axis here, components along the first: that is how the inner loops run fast.
+Points lie along the last axis, components along the first, for speed.
 """
 
 from typing import Any
@@ -16,19 +16,19 @@ from jaxloc.sensors import Pinhole, StereoRig
 from jaxloc.solvers import Linearization, Problem, Quadratic
 from jaxloc.solvers.problem import is_quadratic
 
-# Residual, in sigmas, of a point that the camera cannot see: dear, so that no step hides points behind the camera.
-_UNSEEN = 1e3
+# Residual of an invisible point, sigmas: large, so that no step moves points behind the camera.
+_HIDDEN = 1e3
 
 
 class Reprojection(Problem):
-    """Pixels of known points in one camera; the state is its pose ``T_world_camera``.
+    """Least-squares problem of pixels of known points in one camera; the state is its pose ``T_world_camera``.
 
     Attributes:
         camera: the camera.
         points: "3 n", world frame, m; finite everywhere.
         pixels: "2 n" (u, v), px; finite everywhere.
         sigma: standard deviation of a pixel coordinate, px.
-        valid: items that count.
+        valid: items that are used.
         loss: robust kernel over the two components of an item.
     """
 
@@ -41,43 +41,43 @@ class Reprojection(Problem):
 
     def residual(self, state: SE3) -> Float[Array, "2 n"]:
         """Whitened pixel errors, zero for masked items [K-56]."""
-        c, seen = _camera_points(self.camera, state, self.points, self.valid)
+        c, visible = _camera_points(self.camera, state, self.points, self.valid)
         predicted = jnp.stack(self.camera.project_components(*c))
-        return _mask(predicted - self.pixels, seen, self.valid, 1.0 / self.sigma)
+        return _mask(predicted - self.pixels, visible, self.valid, 1.0 / self.sigma)
 
     def linearize(self, state: SE3) -> Linearization:
         """Residual and its Jacobian in closed form."""
-        c, seen = _camera_points(self.camera, state, self.points, self.valid)
+        c, visible = _camera_points(self.camera, state, self.points, self.valid)
         predicted = jnp.stack(self.camera.project_components(*c))
-        # Weight and mask enter at the smallest arrays.
-        weight = jnp.where(seen, 1.0 / self.sigma, 0.0)
+        # Weight and mask are applied to the smallest arrays.
+        weight = jnp.where(visible, 1.0 / self.sigma, 0.0)
         jacobian = _pose_jacobian(_pixel_jacobian(self.camera, c, weight), c)
-        return Linearization(_mask(predicted - self.pixels, seen, self.valid, 1.0 / self.sigma), jacobian)
+        return Linearization(_mask(predicted - self.pixels, visible, self.valid, 1.0 / self.sigma), jacobian)
 
     def admissible(self, state: SE3) -> Bool[Array, ""]:
-        """Whether three points are ahead of the camera and, under plain least squares, every point that counts."""
-        return _enough_seen(self.camera, state, self.points, self.valid, self.loss)
+        """Whether three points are in front of the camera and, under plain least squares, all valid points."""
+        return _enough_visible(self.camera, state, self.points, self.valid, self.loss)
 
     def hessian(self, state: SE3) -> Float[Array, "6 6"]:
         """Exact Hessian at a minimum."""
-        c, seen = _camera_points(self.camera, state, self.points, self.valid)
+        c, visible = _camera_points(self.camera, state, self.points, self.valid)
 
         def item_cost(*c: Array) -> Array:
             error = (jnp.stack(self.camera.project_components(*c)) - self.pixels) / self.sigma
-            return jnp.where(seen, self.loss.rho(jnp.sum(error**2, axis=0)), 0.0)
+            return jnp.where(visible, self.loss.rho(jnp.sum(error**2, axis=0)), 0.0)
 
         return _rigid_hessian(item_cost, c)
 
 
 class StereoReprojection(Problem):
-    """Stereo measurements of points known with error; the state is the pose ``T_world_camera`` of the left camera.
+    """Least-squares problem of stereo measurements of uncertain points; the state is the left ``T_world_camera``.
 
     Attributes:
         rig: the stereo rig.
         points: "3 n", world frame, m; finite everywhere.
         measured: "3 n" (u_left, u_right, v), px; finite everywhere.
         whitener: "3 3 n", lower triangular ``W`` with ``W S W^T = I`` for the covariance S of an item's residual.
-        valid: items that count.
+        valid: items that are used.
         loss: robust kernel over the three components of an item.
     """
 
@@ -90,31 +90,31 @@ class StereoReprojection(Problem):
 
     def residual(self, state: SE3) -> Float[Array, "3 n"]:
         """Whitened measurement errors, zero for masked items."""
-        c, seen = _camera_points(self.rig.camera, state, self.points, self.valid)
-        return self._whitened_error(c, seen)
+        c, visible = _camera_points(self.rig.camera, state, self.points, self.valid)
+        return self._whitened_error(c, visible)
 
-    def _whitened_error(self, c: tuple[Array, Array, Array], seen: Bool[Array, " n"]) -> Float[Array, "3 n"]:
+    def _whitened_error(self, c: tuple[Array, Array, Array], visible: Bool[Array, " n"]) -> Float[Array, "3 n"]:
         error = self.rig.project_components(*c) - self.measured
-        return _mask(_lower_product(self.whitener, error), seen, self.valid, 1.0)
+        return _mask(_lower_product(self.whitener, error), visible, self.valid, 1.0)
 
     def linearize(self, state: SE3) -> Linearization:
         """Residual and its Jacobian in closed form."""
-        c, seen = _camera_points(self.rig.camera, state, self.points, self.valid)
+        c, visible = _camera_points(self.rig.camera, state, self.points, self.valid)
         jacobian = _pose_jacobian(stereo_jacobian(self.rig, c), c)
         jacobian = jax.vmap(lambda column: _lower_product(self.whitener, column))(jacobian)
-        return Linearization(self._whitened_error(c, seen), jnp.where(seen[None, None, :], jacobian, 0.0))
+        return Linearization(self._whitened_error(c, visible), jnp.where(visible[None, None, :], jacobian, 0.0))
 
     def admissible(self, state: SE3) -> Bool[Array, ""]:
-        """Whether three points are ahead of the camera and, under plain least squares, every point that counts."""
-        return _enough_seen(self.rig.camera, state, self.points, self.valid, self.loss)
+        """Whether three points are in front of the camera and, under plain least squares, all valid points."""
+        return _enough_visible(self.rig.camera, state, self.points, self.valid, self.loss)
 
     def hessian(self, state: SE3) -> Float[Array, "6 6"]:
         """Exact Hessian at a minimum."""
-        c, seen = _camera_points(self.rig.camera, state, self.points, self.valid)
+        c, visible = _camera_points(self.rig.camera, state, self.points, self.valid)
 
         def item_cost(*c: Array) -> Array:
             error = _lower_product(self.whitener, self.rig.project_components(*c) - self.measured)
-            return jnp.where(seen, self.loss.rho(jnp.sum(error**2, axis=0)), 0.0)
+            return jnp.where(visible, self.loss.rho(jnp.sum(error**2, axis=0)), 0.0)
 
         return _rigid_hessian(item_cost, c)
 
@@ -122,29 +122,29 @@ class StereoReprojection(Problem):
 def _camera_points(
     camera: Pinhole, pose: SE3, points: Float[Array, "3 n"], valid: Bool[Array, " n"]
 ) -> tuple[Any, Any]:
-    """Component arrays of the points in the camera frame, safe where they cannot be seen, and where they can."""
+    """Component arrays of the points in the camera frame, with finite values where invisible, and the visible mask."""
     rotation = pose.rotation.matrix()
     moved = matmul(rotation.T, points - pose.translation[:, None])
-    seen = valid & camera.in_front_components(moved[0], moved[1], moved[2])
-    x, y, z = jnp.where(seen, moved[0], 0.0), jnp.where(seen, moved[1], 0.0), jnp.where(seen, moved[2], 1.0)
-    return (x, y, z), seen
+    visible = valid & camera.in_front_components(moved[0], moved[1], moved[2])
+    x, y, z = jnp.where(visible, moved[0], 0.0), jnp.where(visible, moved[1], 0.0), jnp.where(visible, moved[2], 1.0)
+    return (x, y, z), visible
 
 
-def _enough_seen(camera: Pinhole, pose: SE3, points: Array, valid: Array, loss: Any) -> Bool[Array, ""]:
-    """Three points at least: rounding can hide that two leave a direction open.
+def _enough_visible(camera: Pinhole, pose: SE3, points: Array, valid: Array, loss: Any) -> Bool[Array, ""]:
+    """At least three points, since rounding can hide that two are degenerate.
 
-    Robust kernels take a point behind the camera for an outlier; otherwise the pose or the data are wrong.
+    Robust kernels treat a point behind the camera as an outlier; otherwise the pose or the data are wrong.
     """
-    _, seen = _camera_points(camera, pose, points, valid)
-    enough = jnp.sum(seen) >= 3
-    return enough & jnp.all(seen == valid) if is_quadratic(loss) else enough
+    _, visible = _camera_points(camera, pose, points, valid)
+    enough = jnp.sum(visible) >= 3
+    return enough & jnp.all(visible == valid) if is_quadratic(loss) else enough
 
 
 def _mask(
-    error: Float[Array, "k n"], seen: Bool[Array, " n"], valid: Bool[Array, " n"], scale: Any
+    error: Float[Array, "k n"], visible: Bool[Array, " n"], valid: Bool[Array, " n"], scale: Any
 ) -> Float[Array, "k n"]:
-    unseen = jnp.where(valid & ~seen, _UNSEEN, 0.0).astype(error.dtype)
-    return jnp.where(seen[None, :], error * scale, unseen[None, :])
+    hidden = jnp.where(valid & ~visible, _HIDDEN, 0.0).astype(error.dtype)
+    return jnp.where(visible[None, :], error * scale, hidden[None, :])
 
 
 def _pixel_jacobian(camera: Pinhole, c: tuple[Array, Array, Array], weight: Any = 1.0) -> Float[Array, "3 2 n"]:
@@ -184,9 +184,9 @@ def _pose_jacobian(point_jacobian: Float[Array, "3 k n"], c: tuple[Array, Array,
 def _rigid_hessian(item_cost: Any, c: tuple[Array, Array, Array]) -> Float[Array, "6 6"]:
     """Hessian, along the tangent of a pose, of a sum of costs of points in the frame of the camera, at a minimum.
 
-    The chain rule to second order: the curvature A of a cost in its point gives ``D^T A D`` with the derivative D of
-    the point, and its slope g meets the second derivative of ``exp(-d) c``, whose part ``g . (w x (w x c)) / 2`` is
-    left over where the slopes add up to zero.
+    The chain rule to second order: the Hessian A of a cost in its point gives ``D^T A D`` with the derivative D of the
+    point, and its gradient g multiplies the second derivative of ``exp(-d) c``, of which ``g . (w x (w x c)) / 2``
+    remains where the gradients sum to zero.
     """
     one, zero = jnp.ones_like(c[0]), jnp.zeros_like(c[0])
 

@@ -30,19 +30,19 @@ def refine_motion(
 ) -> Estimate:
     """Motion of a stereo rig from matched measurements in two frames (errors in variables).
 
-    Points triangulated in the previous frame carry their covariance ``S0`` into the residual ``h(T^-1 X) - z``, whose
+    The covariance ``S0`` of points triangulated in the previous frame enters the residual ``h(T^-1 X) - z``, whose
     covariance is ``S1 + J S0 J^T``: near points with good depth count for translation, far ones for rotation only.
 
     Args:
         rig: the stereo rig.
         previous: "n 3" (u_left, u_right, v) in the previous frame, px.
         current: "n 3" the same points in the current frame, px.
-        initial: guess of ``T_previous_current``, the pose of the current left camera in the previous one.
+        initial: ``T_previous_current``, the pose of the current left camera in the previous one.
         covariance_previous: of measurements in the previous frame, px^2, one for all or one a point; identity
             by default.
         covariance_current: of measurements in the current frame, likewise.
         loss: robust kernel over an item's three components, in sigmas.
-        valid: which matches count.
+        valid: matches that are used.
 
     Returns:
         Estimate of ``T_previous_current`` with covariance in its tangent (axes of the current camera).
@@ -55,13 +55,13 @@ def refine_motion(
         >>> rig = jl.sensors.StereoRig(jl.sensors.Pinhole(700.0, 700.0, 600.0, 180.0), baseline=0.5)
         >>> points = jnp.array([[0.0, 0.0, 9.0], [2.0, 1.0, 8.0], [-2.0, 1.0, 12.0], [1.0, -1.0, 7.0]])
         >>> forward = points - jnp.array([[0.0, 0.0, 1.0]])
-        >>> start = jl.poses.SE3.identity()
-        >>> fit = jl.refinement.stereo_motion.refine_motion(rig, rig.project(points), rig.project(forward), start)
+        >>> initial = jl.poses.SE3.identity()
+        >>> fit = jl.refinement.stereo_motion.refine_motion(rig, rig.project(points), rig.project(forward), initial)
         >>> bool(fit.ok), round(float(fit.value.translation[2]), 3)
         (True, 1.0)
     """
     matches = StereoMatches.of(previous, current, covariance_previous, covariance_current, valid)
-    # The weights depend on the pose so little that those of a first fit serve for the second.
+    # The weights depend little on the pose: those of a first fit are used in the second.
     first = solve(motion_problem(rig, matches, initial, loss), initial, max_steps=10)
     weights_at = jax.tree.map(jax.lax.stop_gradient, first.value)
     problem = motion_problem(rig, matches, weights_at, loss)
@@ -76,7 +76,7 @@ class StereoMatches(eqx.Module):
         current: the same points in the current frame, px.
         covariance_previous: of the measurements in the previous frame, px^2.
         covariance_current: of those in the current frame.
-        valid: slots that hold a match; others hold finite numbers without meaning.
+        valid: slots that hold a match; others hold arbitrary finite numbers.
     """
 
     previous: Float[Array, "n 3"]
@@ -89,7 +89,7 @@ class StereoMatches(eqx.Module):
     def of(
         previous: Array, current: Array, covariance_previous: Any, covariance_current: Any, valid: Any
     ) -> "StereoMatches":
-        """Matches with what is not given filled in, and slots with bad numbers made invalid."""
+        """Matches with default covariances and mask; slots with non-finite values are invalid."""
         usable, previous, current = _usable(valid, previous, current)
 
         def noise(covariance: Any) -> Float[Array, "n 3 3"]:
@@ -101,58 +101,58 @@ class StereoMatches(eqx.Module):
 
 
 def motion_problem(rig: StereoRig, matches: StereoMatches, pose: SE3, loss: Any) -> StereoReprojection:
-    """The motion's problem, linearized in the measurements of the previous frame at a pose near the answer.
+    """Least-squares problem of the motion, linearized in the previous measurements at a pose near the solution.
 
-    Depth is so far from linear in disparity that weights taken at the noisy measurement favor points that noise has
-    brought nearer. So the previous measurement is first moved to where both frames agree best, and the residual and its
+    Depth is so nonlinear in disparity that weights at the noisy measurement favor points that noise has moved nearer.
+    So the previous measurement is first corrected to the most likely one given both frames, and the residual and its
     covariance are expanded there: the step from Sampson's error to maximum likelihood.
 
     Args:
         rig: the stereo rig.
         matches: measurements in two frames.
-        pose: ``T_previous_current`` at which covariances are carried to the current frame.
+        pose: ``T_previous_current`` at which covariances are propagated to the current frame.
         loss: robust kernel.
 
     Returns:
         A problem whose state is ``T_previous_current``.
     """
     usable = matches.valid & rig.has_depth(matches.previous)
-    believed = matches.previous
+    corrected = matches.previous
     for _ in range(2):
-        transfer, predicted = _transfer(rig, pose, believed, usable)
-        shift = matmul(transfer, (matches.previous - believed)[..., None])[..., 0]
+        transfer, predicted = _transfer(rig, pose, corrected, usable)
+        shift = matmul(transfer, (matches.previous - corrected)[..., None])[..., 0]
         error = matches.current - predicted - shift
         total = matches.covariance_current + matmul(transfer, matmul(matches.covariance_previous, transfer.mT))
         whiten = whitener(total)
-        believed = _agreeing_measurement(rig, matches, transfer, whiten, error, believed)
-    transfer, _ = _transfer(rig, pose, believed, usable)
-    shift = matmul(transfer, (matches.previous - believed)[..., None])[..., 0]
+        corrected = _correct_measurement(rig, matches, transfer, whiten, error, corrected)
+    transfer, _ = _transfer(rig, pose, corrected, usable)
+    shift = matmul(transfer, (matches.previous - corrected)[..., None])[..., 0]
     total = matches.covariance_current + matmul(transfer, matmul(matches.covariance_previous, transfer.mT))
-    points = rig.triangulate(believed)
+    points = rig.triangulate(corrected)
     return StereoReprojection(rig, points.T, (matches.current - shift).T, whitener(total), usable, loss)
 
 
 def _transfer(
-    rig: StereoRig, pose: SE3, believed: Array, usable: Array
+    rig: StereoRig, pose: SE3, corrected: Array, usable: Array
 ) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3"]]:
-    """Where points measured in the previous frame appear in the current one, and the derivative of that."""
-    moved = pose.inverse().apply(rig.triangulate(believed))
-    seen = usable & rig.in_front(moved)
-    c = tuple(jnp.where(seen, moved[:, i], 0.0 if i < 2 else 1.0) for i in range(3))
+    """Predicted measurements in the current frame of points measured in the previous one, and their derivative."""
+    moved = pose.inverse().apply(rig.triangulate(corrected))
+    visible = usable & rig.in_front(moved)
+    c = tuple(jnp.where(visible, moved[:, i], 0.0 if i < 2 else 1.0) for i in range(3))
     back = pose.rotation.matrix().T
-    to_point = jax.vmap(lambda z: stereo_triangulation.stereo_jacobian(rig, z))(believed)
+    to_point = jax.vmap(lambda z: stereo_triangulation.stereo_jacobian(rig, z))(corrected)
     by_point = jnp.transpose(stereo_jacobian(rig, c), (2, 1, 0))
     transfer = matmul(by_point, matmul(back[None], to_point))
-    return jnp.where(seen[:, None, None], transfer, 0.0), rig.project_components(*c).T
+    return jnp.where(visible[:, None, None], transfer, 0.0), rig.project_components(*c).T
 
 
-def _agreeing_measurement(
-    rig: StereoRig, matches: StereoMatches, transfer: Array, whiten: Array, error: Array, believed: Array
+def _correct_measurement(
+    rig: StereoRig, matches: StereoMatches, transfer: Array, whiten: Array, error: Array, corrected: Array
 ) -> Float[Array, "n 3"]:
-    """The previous measurement moved to where both frames agree best; that of outliers stays."""
+    """The most likely previous measurement given both frames; that of outliers is unchanged."""
     w = jnp.moveaxis(whiten, -1, 0)
     whitened = matmul(w, error[..., None])
     gain = matmul(matches.covariance_previous, matmul(w, transfer).mT)
     moved = matches.previous + matmul(gain, whitened)[..., 0]
     plausible = jnp.sum(whitened[..., 0] ** 2, axis=1) < 25.0
-    return jnp.where((plausible & rig.has_depth(moved))[:, None], moved, believed)
+    return jnp.where((plausible & rig.has_depth(moved))[:, None], moved, corrected)

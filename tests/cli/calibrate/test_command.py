@@ -116,5 +116,5 @@ def test_bad_input_is_one_line_and_writes_nothing(inputs, tmp_path, capsys):
     refuse("--right: has 1 images, the left camera 8", [left], "--right", left / "view1.png")
     options = tmp_path / "bad.yaml"
     options.write_text("radial: 5\n")
-    refuse("bad.yaml: Glass got radial=5", [left], "--config", options)
+    refuse("bad.yaml: BrownConradyModel got radial=5", [left], "--config", options)
     refuse("no calibration", [left / "view1.png"])

@@ -125,7 +125,7 @@ def test_wrong_options_are_refused(rng):
         detect(ORB(), image, 10, mask=np.ones((3, 3), bool))
 
 
-def test_gray_bytes_survive_bad_numbers():
+def test_to_uint8_of_non_finite_values():
     got = backend.to_uint8(np.array([[np.nan, np.inf, -np.inf, 300.0, -4.0, 7.5]]))
     assert got.tolist() == [[0, 255, 0, 255, 0, 8]]
 

@@ -87,7 +87,7 @@ def test_sums_over_ragged_groups(rng):
 
 @pytest.mark.parametrize(
     "camera, point, message",
-    [([0, 1], [0], "as many"), ([], [], "at least one"), ([0.0], [0], "integers"), ([0, 9], [0, 1], "run from 0 to 9")],
+    [([0, 1], [0], "as many"), ([], [], "at least one"), ([0.0], [0], "integers"), ([0, 9], [0, 1], "are from 0 to 9")],
 )
 def test_wrong_tables_are_refused(camera, point, message):
     with pytest.raises(ValueError, match=message):

@@ -1,7 +1,7 @@
-"""Exhaustive search for a template: every place is scored, the best is refined between pixels.
+"""Template matching by exhaustive search: all positions are scored, the best is refined to subpixels.
 
-Correlation is brute-force association: it needs no start, and as it blurs finding and refining, all peaks can be had,
-and the best comes with its sharpness [K-24, K-26, K-93].
+It needs no initial value, and returns all peaks of the score on request,
+and the covariance of the best [K-24, K-26, K-93].
 """
 
 from jaxloc.alignment.correlation.classify import Classification, classify

@@ -1,4 +1,4 @@
-"""Which of several templates an image shows."""
+"""Classification by template matching: which of several templates an image shows."""
 
 from typing import Any
 
@@ -14,13 +14,13 @@ from jaxloc.images.warps import Translation
 
 
 class Classification(eqx.Module):
-    """Which template of a bank is seen.
+    """Result of a classification.
 
     Attributes:
-        label: its number.
-        translation: where, template to image.
+        label: index of the best template.
+        translation: its position, from template to image pixels.
         scores: the best correlation of each template.
-        ok: True if the best stands out: its distance from perfect is at most 0.8 times that of the next template.
+        ok: True if one minus the best correlation is at most 0.8 times that of the next template.
     """
 
     label: Int[Array, ""]
@@ -33,7 +33,7 @@ class Classification(eqx.Module):
 def classify(
     image: Num[Array, "h w"] | Any, templates: Num[Array, "k m n"] | Any, *, score: Score = ZeroMeanCorrelation()
 ) -> Classification:
-    """Tells which template of a bank an image shows, and where: the one of the highest correlation.
+    """Classifies an image by the template of the highest correlation, and locates it.
 
     Args:
         image: gray levels.
@@ -41,7 +41,7 @@ def classify(
         score: a correlation.
 
     Returns:
-        Label, place, scores of all templates, and whether the best stands out.
+        Label, position, scores of all templates, and whether the best is distinct.
 
     Raises:
         ValueError: the score is a distance, or templates are larger than the image.
@@ -52,8 +52,8 @@ def classify(
     Example:
         >>> import jax, jax.numpy as jnp
         >>> bank = jax.random.uniform(jax.random.key(0), (3, 8, 8))
-        >>> seen = classify(jnp.zeros((20, 20)).at[5:13, 3:11].set(bank[2]), bank)
-        >>> int(seen.label), seen.translation.translation.round().tolist(), bool(seen.ok)
+        >>> found = classify(jnp.zeros((20, 20)).at[5:13, 3:11].set(bank[2]), bank)
+        >>> int(found.label), found.translation.translation.round().tolist(), bool(found.ok)
         (2, [3.0, 5.0], True)
     """
     if score.best_is_least:

@@ -1,4 +1,4 @@
-"""Detection of a known pattern in noise: no linear filter tells it from noise better than correlation [K-25]."""
+"""Matched filter: the linear filter of the greatest signal-to-noise ratio for a known pattern [K-25]."""
 
 from abc import abstractmethod
 from typing import Any
@@ -12,11 +12,11 @@ from jaxloc.images.normalization import as_gray
 
 
 class Response(eqx.Module):
-    """What a matched filter gives.
+    """Response of a matched filter.
 
     Attributes:
-        statistic: in standard deviations of the noise: normal with variance one, and mean ``sqrt(gain)`` where the
-            pattern lies with its first pixel.
+        statistic: in standard deviations of the noise: normal with variance one, and mean ``sqrt(gain)`` at the
+            position of the pattern's first pixel.
         gain: output signal-to-noise ratio, a ratio of powers: the pattern's energy over sigma^2 in white noise.
     """
 
@@ -64,7 +64,7 @@ class ColoredNoise(Noise):
 
 @eqx.filter_jit
 def respond(image: Num[Array, "h w"] | Any, pattern: Num[Array, "m n"] | Any, *, noise: Noise) -> Response:
-    """Filters an image so that a pattern stands out of noise as far as any linear filter can make it.
+    """Filters an image for the greatest signal-to-noise ratio at a pattern.
 
     With S the pattern's spectrum and N the noise's density, the filter is ``conj(S) / N``: in white noise, correlation
     with the pattern. The output signal-to-noise ratio is ``mean(|S|^2 / N)``: in white noise, the pattern's energy over
@@ -72,11 +72,11 @@ def respond(image: Num[Array, "h w"] | Any, pattern: Num[Array, "m n"] | Any, *,
 
     Args:
         image: gray levels without background (subtract it); pixels that are not finite are taken as zero.
-        pattern: the known signal, gray levels; subtract its mean to be blind to the brightness of the background.
+        pattern: the known signal, gray levels; subtract its mean for invariance to the brightness of the background.
         noise: `WhiteNoise` or `ColoredNoise`.
 
     Returns:
-        The statistic at every place of the pattern's first pixel where it fits on the image, and the gain.
+        The statistic at every position of the pattern's first pixel for which it lies within the image, and the gain.
 
     Raises:
         ValueError: the pattern is larger than the image, or the noise's spectrum has another shape.
@@ -87,8 +87,8 @@ def respond(image: Num[Array, "h w"] | Any, pattern: Num[Array, "m n"] | Any, *,
     Example:
         >>> import jax.numpy as jnp
         >>> pattern = jnp.array([[3.0, 4.0]])
-        >>> seen = respond(jnp.zeros((6, 8)).at[2, 3:5].set(pattern[0]), pattern, noise=WhiteNoise(1.0))
-        >>> round(float(seen.gain), 2), round(float(seen.statistic[2, 3]), 2)
+        >>> found = respond(jnp.zeros((6, 8)).at[2, 3:5].set(pattern[0]), pattern, noise=WhiteNoise(1.0))
+        >>> round(float(found.gain), 2), round(float(found.statistic[2, 3]), 2)
         (25.0, 5.0)
     """
     pattern = as_gray(pattern)
@@ -108,11 +108,11 @@ def respond(image: Num[Array, "h w"] | Any, pattern: Num[Array, "m n"] | Any, *,
 
 
 def threshold(false_alarms: float | Float[Array, ""], *, places: int) -> Float[Array, ""]:
-    """The statistic that noise alone exceeds at a given expected number of places.
+    """Threshold of the statistic for an expected number of false alarms.
 
     Args:
-        false_alarms: expected number of false alarms in an image; below one about the chance of any.
-        places: number of places of the pattern.
+        false_alarms: expected number in an image; below one, about the probability of any.
+        places: number of positions of the pattern.
 
     Returns:
         Standard deviations: the normal quantile of ``1 - false_alarms / places``.

@@ -1,4 +1,4 @@
-"""Peaks of a score surface: where they are between pixels, how sharp, and how far above the next one."""
+"""Peaks of a score surface: subpixel positions, curvature, and ratio of the two highest."""
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ class Peaks(eqx.Module):
         uv: positions (right, down) on the surface, between its pixels; the pixel itself where not sharp.
         scores: heights, of the fitted parabola where sharp.
         valid: False in slots that no peak fills; these are zero.
-        sharp: True where the peak lies inside the border and curves down on all sides.
+        sharp: True where the peak lies inside the border and the Hessian is negative definite.
     """
 
     uv: Float[Array, "n 2"]
@@ -24,7 +24,7 @@ class Peaks(eqx.Module):
 
     @property
     def ratio(self) -> Float[Array, ""]:
-        """Second height over the first: near 1 the choice between both is ambiguous; 0 if there is one peak only."""
+        """Ratio of the second height to the first: near 1 the choice is ambiguous; 0 if there is one peak only."""
         if self.scores.shape[0] < 2:
             return jnp.zeros((), self.scores.dtype)
         known = self.valid[1] & (jnp.abs(self.scores[0]) > 0)
@@ -32,7 +32,7 @@ class Peaks(eqx.Module):
 
 
 class Parabola(eqx.Module):
-    """The second-order surface through the neighbors of a pixel.
+    """Quadratic model of a surface at a pixel.
 
     Attributes:
         offset: of its extremum from the pixel (right, down), zero where not sharp.
@@ -86,7 +86,7 @@ def fit_parabola(patch: Float[Array, "3 3"]) -> Parabola:
 
 
 def fit_parabola_at(surface: Float[Array, "p q"], row: Int[Array, ""], column: Int[Array, ""]) -> Parabola:
-    """The parabola at a pixel of a surface; on the border it is not sharp.
+    """The quadratic model at a pixel of a surface; not sharp on the border.
 
     Example:
         >>> import jax.numpy as jnp
@@ -104,14 +104,14 @@ def fit_parabola_at(surface: Float[Array, "p q"], row: Int[Array, ""], column: I
 
 @eqx.filter_jit
 def find_peaks(surface: Float[Array, "p q"], *, count: int = 4, separation: int = 3) -> Peaks:
-    """Finds the highest local maxima that keep a distance from each other (non-maximum suppression).
+    """Highest local maxima with a least distance from each other (non-maximum suppression).
 
-    A pixel is a candidate if none of its eight neighbors is higher. The highest is taken, the square of ``separation``
-    pixels to all sides is dropped, and so on. Positions and heights are those of parabolas, differentiable in the
+    A pixel is a candidate if none of its eight neighbors is higher. The highest is kept, the square of ``separation``
+    pixels to all sides is removed, and so on. Positions and heights are those of parabolas, differentiable in the
     surface.
 
     Args:
-        surface: scores, higher is better (negate distances); pixels that are not finite are no candidates.
+        surface: scores, higher is better (negate distances); non-finite pixels are no candidates.
         count: static number of slots.
         separation: least distance of two peaks along rows or columns, px.
 
@@ -122,7 +122,7 @@ def find_peaks(surface: Float[Array, "p q"], *, count: int = 4, separation: int 
         ValueError: count or separation is below one.
 
     References:
-        Search without refinement reports all it saw [K-26, K-93].
+        Exhaustive search reports all peaks [K-26, K-93].
 
     Example:
         >>> import jax.numpy as jnp
@@ -137,12 +137,12 @@ def find_peaks(surface: Float[Array, "p q"], *, count: int = 4, separation: int 
     safe = jnp.where(finite, surface, 0.0)
     left = _candidates(lax.stop_gradient(safe), finite)
 
-    def take(left: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+    def select(left: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
         index = jnp.argmax(left)
         row, column = index // surface.shape[1], index % surface.shape[1]
         return _suppress(left, row, column, separation), (index, left.reshape(-1)[index] > -jnp.inf)
 
-    _, (index, valid) = lax.scan(take, left, None, length=count)
+    _, (index, valid) = lax.scan(select, left, None, length=count)
     row, column = index // surface.shape[1], index % surface.shape[1]
     fits = jax.vmap(lambda r, c: fit_parabola_at(safe, r, c))(row, column)
     uv = jnp.stack([column, row], axis=1).astype(surface.dtype) + fits.offset

@@ -1,7 +1,7 @@
-"""How alike a template and every place of an image are: sums over the template by convolution or Fourier transform.
+"""Similarity scores of a template at all positions of an image, by convolution or Fourier transform.
 
-Local means and energies come from additions only (windows doubled in width), never from differences of running sums, so
-that float32 keeps its digits on bright images and in flat places.
+Local means and energies use additions only (windows doubled in width), never differences of running sums, so
+that float32 is accurate on bright images and in flat regions.
 """
 
 from abc import abstractmethod
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 
 class Correlator(eqx.Module):
-    """How ``c(t) = sum_x k(x) I(x + t)`` is computed for all shifts t that keep the kernel on the image."""
+    """Method to compute ``c(t) = sum_x k(x) I(x + t)`` for all shifts t that keep the kernel within the image."""
 
     @abstractmethod
     def correlate(self, image: Float[Array, "h w"], kernel: Float[Array, "m n"]) -> Float[Array, "p q"]:
@@ -22,7 +22,7 @@ class Correlator(eqx.Module):
 
 
 class Direct(Correlator):
-    """Multiplies and adds at every place: best for templates up to about 32x32."""
+    """Direct convolution: fastest for templates up to about 32x32."""
 
     def correlate(self, image: Float[Array, "h w"], kernel: Float[Array, "m n"]) -> Float[Array, "p q"]:
         """By convolution."""
@@ -31,10 +31,10 @@ class Direct(Correlator):
 
 
 class Fourier(Correlator):
-    """Multiplies spectra: the time does not grow with the template."""
+    """Products of spectra: the time does not depend on the template's size."""
 
     def correlate(self, image: Float[Array, "h w"], kernel: Float[Array, "m n"]) -> Float[Array, "p q"]:
-        """By fast Fourier transforms; what wraps around the border is cut off."""
+        """By fast Fourier transforms, without the positions that wrap around the border."""
         shape = tuple(quick_length(side) for side in image.shape)
         product = jnp.fft.rfft2(image, shape) * jnp.conj(jnp.fft.rfft2(kernel, shape))
         rows, columns = (side - size + 1 for side, size in zip(image.shape, kernel.shape, strict=True))
@@ -59,13 +59,13 @@ def quick_length(length: int) -> int:
 
 
 class Pair(eqx.Module):
-    """An image and a template, ready to be compared.
+    """An image and a template with finite values.
 
     Attributes:
         image: gray levels, finite.
         template: gray levels, finite.
         mask: weights of the template's pixels, or None for all of them.
-        by: how sums are computed.
+        by: method of the sums.
     """
 
     image: Float[Array, "h w"]
@@ -75,27 +75,27 @@ class Pair(eqx.Module):
 
     @property
     def count(self) -> Float[Array, ""]:
-        """Number of template pixels that count."""
+        """Sum of the weights of the template's pixels."""
         total = jnp.asarray(float(self.template.size), self.template.dtype) if self.mask is None else self.mask.sum()
         return jnp.maximum(total, 1.0)
 
     def over_mask(self, image: Float[Array, "h w"]) -> Float[Array, "p q"]:
-        """Sums of an image over the template's pixels, at every place."""
+        """Sums of an image over the template's pixels, at every position."""
         if self.mask is None:
             return _box_moments(image, self.template.shape)[0]
         return self.by.correlate(image, self.mask)
 
     def centered(self, offset: Float[Array, ""]) -> "Pair":
-        """Both without a common offset; masked template pixels are zero."""
+        """Image and template less a common offset; masked template pixels are zero."""
         template = self.template - offset
         template = template if self.mask is None else template * self.mask
         return Pair(self.image - offset, template, self.mask, self.by)
 
     def zero_mean(self) -> Float[Array, "m n"]:
-        """The template without its mean, what rounding leaves of that included.
+        """The template less its mean, corrected for rounding.
 
-        First without its brightest pixel, which is exact: the mean of a bright template is rounded, and not alike
-        wherever a compiler computes it anew.
+        Its brightest pixel is subtracted first, which is exact: the rounded mean of a bright template may differ
+        wherever a compiler computes it again.
         """
         counts = jnp.ones(self.template.shape, bool) if self.mask is None else self.mask > 0
         brightest = jnp.max(self.template, where=counts, initial=jnp.min(self.template))
@@ -104,35 +104,35 @@ class Pair(eqx.Module):
         return once.centered(once.mean()).template
 
     def mean(self) -> Float[Array, ""]:
-        """Of the template's pixels that count."""
+        """Weighted mean of the template."""
         template = self.template if self.mask is None else self.template * self.mask
         return template.sum() / self.count
 
 
 class Score(eqx.Module):
-    """A measure of likeness of template and image.
+    """Similarity of template and image.
 
-    Class attribute `best_is_least` tells distances from correlations.
+    The class attribute `best_is_least` is True for distances, False for correlations.
     """
 
     best_is_least: ClassVar[bool] = False
 
     @abstractmethod
     def surface(self, pair: Pair) -> Float[Array, "p q"]:
-        """The measure at every place."""
+        """The score at every position."""
 
     @abstractmethod
     def worst(self, pair: Pair) -> Float[Array, ""]:
-        """The measure given to places with unknown pixels."""
+        """The score of positions with unknown pixels."""
 
 
 class SumOfSquares(Score):
-    """``sum (I - T)^2``: the least is best; gray levels have to be the same in both images."""
+    """``sum (I - T)^2``: least is best; assumes equal gray levels in both images."""
 
     best_is_least = True
 
     def surface(self, pair: Pair) -> Float[Array, "p q"]:
-        """Sums of squares, below zero by rounding at most."""
+        """Sums of squares, negative at most by rounding."""
         pair = pair.centered(pair.mean())
         energy = pair.over_mask(pair.image * pair.image)
         return energy - 2.0 * pair.by.correlate(pair.image, pair.template) + jnp.sum(pair.template**2)
@@ -144,7 +144,7 @@ class SumOfSquares(Score):
 
 
 class NormalizedCorrelation(Score):
-    """``sum I T / sqrt(sum I^2 sum T^2)``: blind to contrast, not to brightness. In [-1, 1], 0 if one is black."""
+    """``sum I T / sqrt(sum I^2 sum T^2)``: invariant to gain, not to bias. In [-1, 1], 0 if one is black."""
 
     def surface(self, pair: Pair) -> Float[Array, "p q"]:
         """Cosines."""
@@ -157,12 +157,12 @@ class NormalizedCorrelation(Score):
         return jnp.where(known, pair.by.correlate(pair.image, pair.template) / jnp.sqrt(scale), 0.0)
 
     def worst(self, pair: Pair) -> Float[Array, ""]:
-        """No likeness."""
+        """Zero."""
         return jnp.zeros((), pair.image.dtype)
 
 
 class ZeroMeanCorrelation(Score):
-    """Correlation coefficient: blind to gain and bias. In [-1, 1], 0 where either is flat [K-22]."""
+    """Correlation coefficient: invariant to gain and bias. In [-1, 1], 0 where either is flat [K-22]."""
 
     def surface(self, pair: Pair) -> Float[Array, "p q"]:
         """Coefficients."""
@@ -178,12 +178,12 @@ class ZeroMeanCorrelation(Score):
         return jnp.where(known, pair.by.correlate(pair.image, template) / jnp.sqrt(scale), 0.0)
 
     def worst(self, pair: Pair) -> Float[Array, ""]:
-        """No likeness."""
+        """Zero."""
         return jnp.zeros((), pair.image.dtype)
 
 
 def _rounding(pair: Pair) -> Float[Array, ""]:
-    """Sum of squares that rounding alone leaves, in units of the squared brightness."""
+    """Rounding error of a sum of squares, relative to the squared brightness."""
     return pair.count * (16.0 * float(jnp.finfo(pair.image.dtype).eps)) ** 2
 
 
@@ -192,58 +192,58 @@ def _variance_sums(pair: Pair) -> Float[Array, "p q"]:
     if pair.mask is None:
         return _box_moments(pair.image, pair.template.shape)[1]
     sums = pair.over_mask(pair.image)
-    spread = pair.over_mask(pair.image * pair.image) - sums * sums / pair.count
-    # The difference of two large numbers: what rounding may have left is taken for nothing.
+    squares = pair.over_mask(pair.image * pair.image) - sums * sums / pair.count
+    # The difference of two large numbers: values within rounding are set to zero.
     floor = 64.0 * float(jnp.finfo(sums.dtype).eps) * pair.count * jnp.max(pair.image**2)
-    return jnp.where(spread > floor, spread, 0.0)
+    return jnp.where(squares > floor, squares, 0.0)
 
 
 def _box_moments(image: Array, size: tuple[int, int]) -> tuple[Float[Array, "p q"], Float[Array, "p q"]]:
-    """Sums, and sums of squares about the mean, over windows of `size = (rows, columns)` at every place.
+    """Sums, and sums of squares about the mean, over windows of `size = (rows, columns)` at every position.
 
     Windows are joined two by two (Chan, Golub, LeVeque, 1979), first along columns, then along rows: additions only.
     """
-    sums, spread, count = image, jnp.zeros_like(image), 1
+    sums, squares, count = image, jnp.zeros_like(image), 1
     for axis, length in enumerate(size):
-        sums, spread = _extend(sums, spread, count, length, axis)
+        sums, squares = _extend(sums, squares, count, length, axis)
         count *= length
-    return sums, spread
+    return sums, squares
 
 
-def _extend(sums: Array, spread: Array, count: int, length: int, axis: int) -> tuple[Array, Array]:
-    """Joins `length` windows of `count` pixels each that follow each other along an axis."""
+def _extend(sums: Array, squares: Array, count: int, length: int, axis: int) -> tuple[Array, Array]:
+    """Moments of `length` adjacent windows of `count` pixels each, joined along an axis."""
     done, reach = None, 0
     power = 1
     while power <= length:
         if length & power:
             done = (
-                (sums, spread)
+                (sums, squares)
                 if done is None
-                else _join(done, (sums, spread), count * reach, count * power, reach, axis)
+                else _join(done, (sums, squares), count * reach, count * power, reach, axis)
             )
             reach += power
         power *= 2
         if power <= length:
-            sums, spread = _join(
-                (sums, spread), (sums, spread), count * power // 2, count * power // 2, power // 2, axis
+            sums, squares = _join(
+                (sums, squares), (sums, squares), count * power // 2, count * power // 2, power // 2, axis
             )
     return done
 
 
 def _join(first: tuple, second: tuple, count: int, other: int, shift: int, axis: int) -> tuple[Array, Array]:
-    """Moments of windows and of those `shift` pixels on, together."""
+    """Joint moments of windows and of those `shift` pixels further."""
     length = second[0].shape[axis] - shift
     length = min(length, first[0].shape[axis])
-    (sums, spread), (sums_on, spread_on) = (
+    (sums, squares), (sums_on, squares_on) = (
         [lax.slice_in_dim(part, start, start + length, axis=axis) for part in parts]
         for parts, start in ((first, 0), (second, shift))
     )
-    apart = sums_on / other - sums / count
-    return sums + sums_on, spread + spread_on + apart * apart * (count * other / (count + other))
+    difference = sums_on / other - sums / count
+    return sums + sums_on, squares + squares_on + difference * difference * (count * other / (count + other))
 
 
 def unknown_places(finite: Bool[Array, "h w"], size: tuple[int, int]) -> Bool[Array, "p q"]:
-    """Where a window of `size = (rows, columns)` holds a pixel that is not finite.
+    """Positions at which a window of `size = (rows, columns)` contains a non-finite pixel.
 
     Example:
         >>> import jax.numpy as jnp

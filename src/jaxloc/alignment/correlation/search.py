@@ -1,7 +1,6 @@
-"""Exhaustive search for a template: every place of a window is scored, the best is refined between pixels.
+"""Template matching: exhaustive search of a window with subpixel refinement and covariance.
 
-Correlation and other brute-force association need no start, and blur finding with refining: so all peaks can be had,
-and the best comes with its sharpness [K-24, K-26, K-93].
+It needs no initial value [K-24, K-26, K-93].
 """
 
 from typing import Any
@@ -26,14 +25,14 @@ from jaxloc.images.normalization import as_gray
 from jaxloc.images.warps import Translation
 from jaxloc.solvers import Estimate, Status
 
-_DIRECT_UP_TO = 32 * 32  # template pixels, above which Fourier transforms are quicker
+_DIRECT_UP_TO = 32 * 32  # template pixels, above which Fourier transforms are faster
 
 
 class Window(eqx.Module):
-    """The part of an image in which a template is looked for.
+    """Search window: a part of an image.
 
     Attributes:
-        corner: its first pixel (right, down), rounded; a window that would leave the image is moved back into it.
+        corner: its first pixel (right, down), rounded; a window that exceeds the image is moved into it.
         size: static (rows, columns).
     """
 
@@ -42,7 +41,7 @@ class Window(eqx.Module):
 
     @staticmethod
     def around(prediction: Translation, template_shape: tuple[int, int], *, reach: int) -> "Window":
-        """The window in which a template lies at most `reach` px from where it is predicted.
+        """The window for a template within `reach` px of its predicted position.
 
         Example:
             >>> import jax.numpy as jnp, jaxloc as jl
@@ -61,14 +60,14 @@ def score_map(
     by: Correlator | None = None,
     mask: Num[Array, "m n"] | Bool[Array, "m n"] | None = None,
 ) -> Float[Array, "p q"]:
-    """Scores a template at every place of an image: ``s[v, u]`` compares ``template(x)`` with ``image(x + (u, v))``.
+    """Scores a template at every position of an image: ``s[v, u]`` compares ``template(x)`` with ``image(x + (u, v))``.
 
     Args:
-        image: gray levels, bytes or numbers; places that would touch a pixel that is not finite get the worst score.
+        image: gray levels; positions that cover a non-finite pixel get the worst score.
         template: gray levels, no larger than the image.
         score: `SumOfSquares`, `NormalizedCorrelation` or `ZeroMeanCorrelation`.
-        by: `Direct` or `Fourier`; by default the quicker one for the template's size.
-        mask: weights of the template's pixels, in [0, 1]; pixels that are not finite get weight zero. Without a
+        by: `Direct` or `Fourier`; by default the faster one for the template's size.
+        mask: weights of the template's pixels, in [0, 1]; non-finite pixels get weight zero. Without a
             mask, they have the template's mean.
 
     Returns:
@@ -78,7 +77,7 @@ def score_map(
         ValueError: the template is larger than the image, or the mask has another shape.
 
     References:
-        Correlation over a window [K-24]; brightness and contrast taken out [K-22].
+        Correlation over a window [K-24]; invariance to brightness and contrast [K-22].
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -87,7 +86,7 @@ def score_map(
         >>> [int(i) for i in jnp.unravel_index(jnp.argmax(surface), surface.shape)], round(float(surface.max()), 3)
         ([7, 11], 1.0)
     """
-    return _score_map(*_checked(image, template, mask, by), score)
+    return _score_map(*_validate(image, template, mask, by), score)
 
 
 def search(
@@ -101,26 +100,26 @@ def search(
     sigma: Any = None,
     max_ratio: float = 0.8,
 ) -> Estimate:
-    """Finds the shift t under which an image looks like a template: ``image(x + t) ~ template(x)``.
+    """Finds the shift t with ``image(x + t) ~ template(x)`` by exhaustive search and least-squares refinement.
 
-    All whole shifts are scored; the best is refined from the top of the parabola through its neighbors by least squares
-    with the brightness that the score is blind to. The value has the derivatives of that solution. The covariance is
+    All whole shifts are scored; the best is refined from the vertex of its quadratic model by least squares,
+    with the gain and bias to which the score is invariant; the value has the derivatives of the solution. Covariance:
     ``sigma^2 / gain^2 H^-1`` with ``H = sum [T_u T_v]^T [T_u T_v]``, half the Hessian of the sum of squares at the
     peak, brightness projected out; (0.01 px)^2 is added for interpolation.
 
     Args:
-        image: gray levels, bytes or numbers.
+        image: gray levels.
         template: gray levels.
         window: the part of the image to search; all of it by default.
         score: `SumOfSquares`, `NormalizedCorrelation` or `ZeroMeanCorrelation`.
-        by: `Direct` or `Fourier`; by default the quicker one for the template's size.
+        by: `Direct` or `Fourier`; by default the faster one for the template's size.
         mask: weights of the template's pixels.
-        sigma: standard deviation of the image's noise, gray levels; from what differs at the peak if not given.
-        max_ratio: how near to perfect the second peak may come: largest trusted ratio of what is missing at the best
-            peak (sum of squares, or 1 - correlation) to what is missing at the second.
+        sigma: standard deviation of the image's noise, gray levels; estimated from the residual if not given.
+        max_ratio: threshold of ambiguity: greatest ratio of the best peak's misfit (sum of squares, or 1 - correlation)
+            to that of the second peak.
 
     Returns:
-        Estimate of a `Translation` from template to image pixels. `cost` is what is missing at the peak. `ok` is False
+        Estimate of a `Translation` from template to image pixels. `cost` is the misfit at the peak. `ok` is False
         for a flat template, a peak on the border of the window or without curvature (RANK_DEFICIENT), and an ambiguous
         one (INADMISSIBLE); the value is finite in any case.
 
@@ -138,7 +137,7 @@ def search(
         >>> bool(found.ok), [round(x, 1) for x in found.value.translation.tolist()]
         (True, [12.3, 9.6])
     """
-    pair, finite = _checked(image, template, mask, by)
+    pair, finite = _validate(image, template, mask, by)
     if window is not None and any(n > m for n, m in zip(window.size, pair.image.shape, strict=True)):
         raise ValueError(f"search: a window of {window.size} does not fit an image of shape {pair.image.shape}.")
     if window is not None and any(n > m for n, m in zip(pair.template.shape, window.size, strict=True)):
@@ -147,8 +146,8 @@ def search(
     return _search(pair, finite, window, score, sigma, max_ratio)
 
 
-def _checked(image: Any, template: Any, mask: Any, by: Correlator | None) -> tuple[Pair, Bool[Array, "h w"]]:
-    """Finite floats of one dtype, and where the image was."""
+def _validate(image: Any, template: Any, mask: Any, by: Correlator | None) -> tuple[Pair, Bool[Array, "h w"]]:
+    """Finite floats of one dtype, and the mask of finite pixels."""
     template = as_gray(template)
     image = as_gray(image, template.dtype)
     if any(n > m for n, m in zip(template.shape, image.shape, strict=True)):
@@ -163,7 +162,7 @@ def _checked(image: Any, template: Any, mask: Any, by: Correlator | None) -> tup
 
 
 def _filled(image: Array, known: Array) -> Array:
-    """Unknown pixels take the mean, so that they stand out nowhere."""
+    """Replaces unknown pixels by the mean."""
     count = jnp.maximum(jnp.sum(known), 1).astype(image.dtype)
     return jnp.where(known, image, jnp.sum(jnp.where(known, image, 0.0)) / count)
 
@@ -181,28 +180,28 @@ def _search(pair: Pair, finite: Array, window: Window | None, score: Score, sigm
         pair, finite, corner, known = _cut(pair, finite, window)
     surface = _score_map(pair, finite, score)
     heights = -surface if score.best_is_least else surface
-    rivals = find_peaks(lax.stop_gradient(heights), count=2, separation=max(2, min(pair.template.shape) // 4))
+    peaks = find_peaks(lax.stop_gradient(heights), count=2, separation=max(2, min(pair.template.shape) // 4))
     index = jnp.argmax(heights)
     row, column = index // surface.shape[1], index % surface.shape[1]
     fit = fit_parabola_at(heights, row, column)
     peak = jnp.stack([column, row]).astype(corner.dtype)
     shift = refine_shift(pair, score, peak, peak + fit.offset, sigma)
-    missing = _missing(fit.height, score)
-    unsure = missing + _rounding(pair, score) > max_ratio * _missing(rivals.scores[1], score)
+    misfit = _misfit(fit.height, score)
+    ambiguous = misfit + _rounding(pair, score) > max_ratio * _misfit(peaks.scores[1], score)
     status = jnp.asarray(int(Status.CONVERGED), jnp.int32)
     for failed, code in (
-        (~shift.settled, Status.MAX_STEPS),
-        (rivals.valid[1] & unsure, Status.INADMISSIBLE),
+        (~shift.converged, Status.MAX_STEPS),
+        (peaks.valid[1] & ambiguous, Status.INADMISSIBLE),
         (~(fit.sharp & shift.regular), Status.RANK_DEFICIENT),
         (~known, Status.NONFINITE),
     ):
         status = jnp.where(failed, int(code), status)
     steps, value = jnp.asarray(STEPS, jnp.int32), Translation(corner + shift.uv)
-    return Estimate(value, shift.covariance, missing, status == 0, steps, status, shift.information)
+    return Estimate(value, shift.covariance, misfit, status == 0, steps, status, shift.information)
 
 
 def _cut(pair: Pair, finite: Array, window: Window) -> tuple[Pair, Array, Array, Array]:
-    """The window's part of the image, its true corner, and whether the window was finite."""
+    """The window's part of the image, its actual corner, and whether the given corner was finite."""
     known = jnp.all(jnp.isfinite(window.corner))
     last = jnp.array([m - n for m, n in zip(pair.image.shape, window.size, strict=True)][::-1])
     wanted = jnp.round(jnp.where(known, lax.stop_gradient(window.corner), 0.0))
@@ -213,12 +212,12 @@ def _cut(pair: Pair, finite: Array, window: Window) -> tuple[Pair, Array, Array,
     return Pair(image, pair.template, pair.mask, pair.by), finite, corner.astype(pair.image.dtype), known
 
 
-def _missing(height: Array, score: Score) -> Array:
-    """What a peak lacks of a perfect match."""
+def _misfit(height: Array, score: Score) -> Array:
+    """Sum of squares, or one minus correlation."""
     return -height if score.best_is_least else 1.0 - height
 
 
 def _rounding(pair: Pair, score: Score) -> Array:
-    """Differences of two peaks that mean nothing."""
+    """Rounding error of a misfit."""
     scale = jnp.sum(pair.centered(pair.mean()).template ** 2) if score.best_is_least else jnp.ones((), pair.image.dtype)
     return 100.0 * float(jnp.finfo(pair.image.dtype).eps) * scale

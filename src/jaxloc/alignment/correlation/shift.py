@@ -1,20 +1,20 @@
-"""A whole-pixel peak refined by least squares: where, how surely, and with the derivatives of the solution."""
+"""Least-squares refinement of a whole-pixel peak, with covariance and the derivatives of the solution."""
 
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._linalg import matmul
 from jaxloc.alignment.correlation.scores import NormalizedCorrelation, Pair, Score, SumOfSquares
+from jaxloc.features.subpixel import newton_inverse
 from jaxloc.images.gradients import central_difference
 from jaxloc.images.interpolation import Bicubic
 from jaxloc.images.patches import extract
 
-_LEAST_SIGMA = 0.01  # what interpolation errs by without noise, px
+_LEAST_SIGMA = 0.01  # interpolation error without noise, px
 STEPS = 4
 
 
@@ -26,18 +26,18 @@ class Shift(eqx.Module):
         covariance: px^2.
         information: its inverse, zero where not regular.
         regular: True if the template's texture determines both directions.
-        settled: True if the refinement ended near the peak.
+        converged: True if the refinement converged near the peak.
     """
 
     uv: Float[Array, "2"]
     covariance: Float[Array, "2 2"]
     information: Float[Array, "2 2"]
     regular: Bool[Array, ""]
-    settled: Bool[Array, ""]
+    converged: Bool[Array, ""]
 
 
 class _Model(eqx.Module):
-    """The template's linear model of a patch: brightness (what the score is blind to), then both slopes."""
+    """Linear model of a patch: gain and bias (to which the score is invariant) and the template's derivatives."""
 
     rows: Float[Array, "k n"]
     weight: Float[Array, " n"]
@@ -48,31 +48,31 @@ class _Model(eqx.Module):
     shape: tuple[int, int] = eqx.field(static=True)
 
     def regress(self, patch: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        """Step of the shift, gain, and weighted sum of squares that is left."""
+        """Step of the shift, gain, and weighted residual sum of squares."""
         target = patch - self.base
         found = matmul(self.inverse, matmul(self.rows, self.weight * target))
-        left = target - matmul(self.rows.T, found)
+        residual = target - matmul(self.rows.T, found)
         gain = jnp.ones((), patch.dtype) if self.fixed_gain else found[0]
         step = -found[-2:] / jnp.maximum(gain, 0.05)
-        return step, gain, jnp.sum(self.weight * left * left)
+        return step, gain, jnp.sum(self.weight * residual * residual)
 
 
-def refine_shift(pair: Pair, score: Score, peak: Float[Array, "2"], start: Float[Array, "2"], sigma: Any) -> Shift:
-    """Minimizes ``sum (I(x + t) - g T(x) - b)^2`` near a peak of the score, with the brightness that the score knows.
+def refine_shift(pair: Pair, score: Score, peak: Float[Array, "2"], initial: Float[Array, "2"], sigma: Any) -> Shift:
+    """Minimizes ``sum (I(x + t) - g T(x) - b)^2`` near a peak, with gain and bias as in the score.
 
-    Gauss-Newton by the template's slopes (inverse composition), then one Newton step that carries the derivatives of
-    the solution. The covariance is ``sigma^2 / g^2 H^-1`` with H the slopes' Gram matrix, brightness projected out,
-    less what interpolation takes off the noise.
+    Gauss-Newton by the template's derivatives (inverse composition), then one Newton step that has the derivatives of
+    the solution. The covariance is ``sigma^2 / g^2 H^-1`` with H the Gram matrix of the derivatives, gain and bias
+    projected out, corrected for interpolated noise.
 
     Args:
         pair: image and template.
-        score: `SumOfSquares` knows no brightness, `NormalizedCorrelation` a gain, `ZeroMeanCorrelation` gain and bias.
+        score: `SumOfSquares` without gain and bias, `NormalizedCorrelation` with gain, `ZeroMeanCorrelation` with both.
         peak: the best whole shift.
-        start: the top of the parabola there.
-        sigma: the image's noise, or None to take it from what is left.
+        initial: the vertex of its quadratic model.
+        sigma: the image's noise, or None to estimate it from the residual.
 
     Returns:
-        The shift, its covariance and trust; the start where the template is flat.
+        The shift, its covariance and validity; the initial value where the template is flat.
 
     References:
         Baker and Matthews, "Lucas-Kanade 20 years on", 2004, sections 3.2 and 4.
@@ -88,26 +88,23 @@ def refine_shift(pair: Pair, score: Score, peak: Float[Array, "2"], start: Float
         [9.7, 8.2]
     """
     model, frozen = _model(pair, score), lax.stop_gradient(pair)
-    frozen_model, peak, start = lax.stop_gradient((model, peak, start))
+    frozen_model, peak, initial = lax.stop_gradient((model, peak, initial))
 
     def advance(_: Any, uv: Array) -> Array:
         return jnp.clip(uv + frozen_model.regress(_patch(frozen, uv))[0], peak - 1.0, peak + 1.0)
 
-    uv = lax.fori_loop(0, STEPS, advance, start)
-    slope = jax.jacfwd(lambda at: frozen_model.regress(_patch(frozen, at))[0])(uv)
-    determinant = slope[0, 0] * slope[1, 1] - slope[0, 1] * slope[1, 0]
-    steep = (determinant > 0.1) & (slope[0, 0] < 0)
-    slope = jnp.where(steep, slope, -jnp.eye(2, dtype=slope.dtype))
+    uv = lax.fori_loop(0, STEPS, advance, initial)
+    inverses, near = newton_inverse(lambda at: -frozen_model.regress(_patch(frozen, at[0]))[0][None], uv[None])
+    inverse, near = lax.stop_gradient(inverses[0]), near[0]
     step, gain, squares = model.regress(_patch(pair, uv))
-    inverse = lax.stop_gradient(-jnp.linalg.inv(slope))
     step = matmul(inverse, step)
     regular = model.regular & (gain > 0)
-    settled = steep & jnp.all(jnp.abs(step) < 0.1) & jnp.all(jnp.abs(uv - peak) < 1.0)
+    converged = near & jnp.all(jnp.abs(step) < 0.1) & jnp.all(jnp.abs(uv - peak) < 1.0)
     variance = _variance(model, uv, squares, sigma) / jnp.where(regular, jnp.maximum(gain, 0.05), 1.0) ** 2
-    covariance, information = _spread(model, uv, inverse, jnp.where(regular, variance, 0.0))
+    covariance, information = _covariance(model, uv, inverse, jnp.where(regular, variance, 0.0))
     covariance = jnp.where(regular, covariance, jnp.eye(2, dtype=step.dtype))
     information = jnp.where(regular, information, 0.0)
-    return Shift(jnp.where(regular & settled, uv + step, start), covariance, information, regular, settled)
+    return Shift(jnp.where(regular & converged, uv + step, initial), covariance, information, regular, converged)
 
 
 def _patch(pair: Pair, uv: Float[Array, "2"]) -> Float[Array, " n"]:
@@ -121,7 +118,7 @@ def _patch(pair: Pair, uv: Float[Array, "2"]) -> Float[Array, " n"]:
 def _model(pair: Pair, score: Score) -> _Model:
     template = pair.template
     slope = central_difference(template)
-    # Differences across the border see only one side.
+    # Differences at the border are one-sided.
     inner = jnp.pad(jnp.ones(tuple(side - 2 for side in template.shape), template.dtype), 1)
     weight = (inner if pair.mask is None else inner * pair.mask).reshape(-1)
     flat, one = template.reshape(-1), jnp.ones_like(template).reshape(-1)
@@ -140,7 +137,7 @@ def _model(pair: Pair, score: Score) -> _Model:
 
 
 def _inverse(gram: Float[Array, "k k"], energy: Float[Array, ""]) -> tuple[Float[Array, "k k"], Bool[Array, ""]]:
-    """Inverse of the normal matrix, scaled to a unit diagonal, and whether it has one."""
+    """Inverse of the normal matrix, computed with unit diagonal, and whether it is regular."""
     eye, diagonal = jnp.eye(gram.shape[0], dtype=gram.dtype), jnp.diagonal(gram)
     floor = (64.0 * float(jnp.finfo(gram.dtype).eps)) ** 2 * energy
     textured = jnp.all(diagonal > floor)
@@ -152,15 +149,15 @@ def _inverse(gram: Float[Array, "k k"], energy: Float[Array, ""]) -> tuple[Float
 
 
 def _variance(model: _Model, uv: Array, squares: Array, sigma: Any) -> Array:
-    """Of the image's noise; interpolation lets through a part of it only."""
+    """Variance of the image's noise, corrected for interpolation."""
     if sigma is not None:
         return sigma**2
-    freedom = jnp.maximum(jnp.sum(model.weight) - model.rows.shape[0], 1.0)
-    return squares / (freedom * jnp.prod(sum(w * w for w in Bicubic().weights(uv - jnp.floor(uv)))))
+    dof = jnp.maximum(jnp.sum(model.weight) - model.rows.shape[0], 1.0)
+    return squares / (dof * Bicubic().noise_gain(uv))
 
 
-def _spread(model: _Model, uv: Array, slope: Array, variance: Array) -> tuple[Array, Array]:
-    """Covariance, of independent noise carried through interpolation, regression and Newton step, and information."""
+def _covariance(model: _Model, uv: Array, slope: Array, variance: Array) -> tuple[Array, Array]:
+    """Covariance and information of independent noise propagated through interpolation, regression and Newton step."""
     weights = Bicubic().weights(uv - jnp.floor(uv))
     estimator = matmul(slope, matmul(model.inverse[-2:], model.rows * model.weight[None])).reshape(2, *model.shape)
     for axis, coordinate in ((1, 1), (2, 0)):
@@ -172,7 +169,7 @@ def _spread(model: _Model, uv: Array, slope: Array, variance: Array) -> tuple[Ar
 
 
 def _transpose_shift(rows: Float[Array, "2 m n"], weights: list[Float[Array, ""]], axis: int) -> Float[Array, "2 p q"]:
-    """Weights of the image's pixels, given those of the pixels interpolated from them along an axis."""
+    """Transpose of interpolation along an axis: weights of the image's pixels from those of interpolated ones."""
     extra = len(weights) - 1
     pads = [[(extra - k, k) if a == axis else (0, 0) for a in range(3)] for k in range(len(weights))]
     return sum(weight * jnp.pad(rows, pad) for weight, pad in zip(reversed(weights), pads, strict=True))

@@ -1,4 +1,4 @@
-"""Kanade-Lucas-Tomasi tracking of thousands of points at once, proof against changes of exposure."""
+"""Kanade-Lucas-Tomasi (KLT) tracking of many points at once, with gain and bias of every patch."""
 
 from jaxloc.alignment.klt.frames import Frame
 from jaxloc.alignment.klt.records import Klt, Tracked

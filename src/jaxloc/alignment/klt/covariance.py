@@ -1,4 +1,4 @@
-"""The last step of a tracked point: one Newton step that carries the gradient, covariance and trust."""
+"""Last step of tracking: a Newton step that has the derivatives of the solution, covariance and validity."""
 
 import jax
 import jax.numpy as jnp
@@ -31,19 +31,19 @@ def conclude(
     gains: Float[Array, " 2"],
     options: Klt,
 ) -> Tracked:
-    """Judges where points were found, some at a time so that their patches stay in the cache.
+    """Covariance and validity of found positions, in chunks whose patches fit the cache.
 
     Args:
         previous: First frame.
         current: Second frame.
         points: Pixels of the first frame; finite.
-        found: Where they are in the second frame, as `search` says.
+        found: Result of `search` in the second frame.
         usable: Points that can be ok.
         gains: Least and greatest gain.
-        options: Patches and trust.
+        options: Patches and thresholds.
 
     Returns:
-        The points with their gradients, and all that is known of them.
+        The tracked points, with derivatives.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -69,7 +69,7 @@ def conclude(
 
 @jax.custom_jvp
 def _keep_sums(source, below, window, sums: PatchSums) -> PatchSums:
-    """The sums of the search, with the derivatives that summing the patches again has: only gradients pay for it."""
+    """The sums of the search, with derivatives by summing the patches again, which costs only where they are used."""
     return sums
 
 
@@ -86,10 +86,10 @@ def _conclude_some(previous: Frame, current: Frame, points, found: Found, usable
     window = cut_window(current.atlas, found.cell + current.margin, options.size)
     kept = PatchSums(found.gram.T.reshape(3, 3, -1), found.cross.T.reshape(2, 2, 3, -1))
     sums = _keep_sums(source, below.T.astype(dtype), window, kept)
-    fraction, settled = _newton(sums, found.fraction.T, gains)
+    fraction, converged = _newton(sums, found.fraction.T, gains)
     step, gain = regress(sums, fraction, gains)
-    settled = settled & (jnp.max(jnp.abs(step), axis=0) < 0.05)
-    settled = settled & (jnp.max(jnp.abs(fraction - 0.5), axis=0) < 0.6)
+    converged = converged & (jnp.max(jnp.abs(step), axis=0) < 0.05)
+    converged = converged & (jnp.max(jnp.abs(fraction - 0.5), axis=0) < 0.6)
     patch = shift(window, fraction)
     energy = jnp.maximum(jnp.sum(patch * patch, axis=(0, 1)) - jnp.sum(patch, axis=(0, 1)) ** 2 / pixels, 0.0)
     contrast, product = sums.gram[2, 2], at_fraction(sums, fraction)[2]
@@ -98,13 +98,13 @@ def _conclude_some(previous: Frame, current: Frame, points, found: Found, usable
     scale = energy * contrast
     some = scale > 0
     correlation = jnp.where(some, product / jnp.sqrt(jnp.where(some, scale, 1.0)), 0.0)
-    ok = usable & settled & determinant_of(sums)[1] & inside_image(uv, current.shape)
+    ok = usable & converged & determinant_of(sums)[1] & inside_image(uv, current.shape)
     ok = ok & (correlation >= options.min_correlation)
     through = gain * gain * _kept_noise(below).astype(dtype) + _kept_noise(fraction.T)
-    # Interpolated noise is smaller but correlated; on the (smooth) slopes it weighs as much as before interpolation.
+    # Interpolated noise is smaller but correlated; its effect along the (smooth) slopes is that of uncorrelated noise.
     noise = squares / (pixels - 4) * (1.0 + gain * gain) / jnp.maximum(through, 0.05)
     covariance = _covariance(sums, noise / (gain * gain), ok, options)
-    # The root of a perfect match's zero has no gradient; zero is taken there.
+    # The root of a perfect match's zero has no gradient; zero is used there.
     positive = ok & (squares > 0)
     residual = jnp.where(positive, jnp.sqrt(jnp.where(positive, squares / pixels, 1.0)), 0.0)
     gain, correlation = jnp.where(ok, gain, 1.0), jnp.where(ok, correlation, 0.0)
@@ -112,7 +112,7 @@ def _conclude_some(previous: Frame, current: Frame, points, found: Found, usable
 
 
 def _newton(sums: PatchSums, fraction, gains):
-    """Newton steps on the Gauss-Newton step, which is zero at the solution; the last has the solution's gradient."""
+    """Newton steps on the Gauss-Newton step, which is zero at the solution; the last has the solution's derivatives."""
     frozen, fraction = lax.stop_gradient((sums, fraction))
     fraction, _ = _newton_step(frozen, frozen, fraction, gains)
     return _newton_step(sums, frozen, fraction, gains)
@@ -136,22 +136,22 @@ def _newton_step(sums: PatchSums, frozen: PatchSums, fraction, gains):
 
 
 def _kept_noise(fraction):
-    """Share of the pixels' noise variance that bilinear interpolation lets through: the sum of squared weights."""
+    """Variance of bilinearly interpolated noise over that of the pixels: the sum of squared weights."""
     return jnp.prod((1.0 - fraction) ** 2 + fraction**2, axis=1)
 
 
 def _finite(frame: Frame, corner, size: int):
-    """Whether all pixels of each window are numbers; nearly always all of the image are."""
+    """Whether all pixels of each window are finite; nearly always all of the image are."""
 
-    def look(_):
-        bad = jnp.where(frame.finite, 0.0, 1.0).astype(frame.atlas.dtype)
-        return jnp.max(slice_windows(bad, corner + frame.margin, (size, size)), axis=(1, 2)) < 0.5
+    def check(_):
+        unknown = jnp.where(frame.finite, 0.0, 1.0).astype(frame.atlas.dtype)
+        return jnp.max(slice_windows(unknown, corner + frame.margin, (size, size)), axis=(1, 2)) < 0.5
 
-    return lax.cond(frame.clean, lambda _: jnp.ones(corner.shape[0], dtype=bool), look, None)
+    return lax.cond(frame.all_finite, lambda _: jnp.ones(corner.shape[0], dtype=bool), check, None)
 
 
 def _covariance(sums: PatchSums, variance, ok, options: Klt):
-    """Inverse of the structure matrix free of gain and bias, times the noise, with a floor; 1 px^2 where not ok."""
+    """Inverse structure matrix with gain and bias projected out, times the noise, with a floor; 1 px^2 where not ok."""
     (a, b, p), (_, c, q), (_, _, e) = sums.gram
     energy = jnp.where(e > 0, e, 1.0)
     a, b, c = a - p * p / energy, b - p * q / energy, c - q * q / energy

@@ -1,4 +1,4 @@
-"""An image made ready for tracking: all pyramid levels in one array, and the spread of its brightness."""
+"""Image pyramid for tracking, packed into one array, with the distribution of gray levels."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,33 +11,33 @@ _SAMPLES = 4096
 
 
 class Frame(eqx.Module):
-    """An image with what every tracked point needs of it, computed once.
+    """A preprocessed image, shared by all tracked points.
 
     Attributes:
         atlas: Every level with repeated border pixels, level 0 on top, all others side by side below it. Gradients pass
             through level 0 only.
-        finite: Pixels of level 0, its border included, that are numbers.
-        clean: Whether all of them are.
-        spread: Sorted sample of gray levels of a coarse level, to compare exposures.
+        finite: Finite pixels of level 0, its border included.
+        all_finite: Whether all of them are.
+        quantiles: Sorted sample of gray levels of a coarse level, to compare exposures.
         shape: Rows and columns of the image.
         levels: Number of pyramid levels.
-        margin: Repeated pixels round every level.
+        margin: Width of the repeated border of every level, px.
     """
 
     atlas: Float[Array, "a b"]
     finite: Bool[Array, "c d"]
-    clean: Bool[Array, ""]
-    spread: Float[Array, " s"]
+    all_finite: Bool[Array, ""]
+    quantiles: Float[Array, " s"]
     shape: tuple[int, int] = eqx.field(static=True)
     levels: int = eqx.field(static=True)
     margin: int = eqx.field(static=True)
 
 
 def build_frame(image: Float[Array, "h w"] | UInt8[Array, "h w"], levels: int, margin: int) -> Frame:
-    """Builds the pyramid and packs it; what is not a number becomes the mean of the others.
+    """Builds and packs the pyramid; non-finite pixels are replaced by the mean of the others.
 
     Args:
-        image: Gray image; integers become float32.
+        image: Grayscale image; integers become float32.
         levels: Number of pyramid levels.
         margin: Pixels by which the border of every level is repeated.
 
@@ -50,21 +50,21 @@ def build_frame(image: Float[Array, "h w"] | UInt8[Array, "h w"], levels: int, m
         >>> frame.atlas.shape, frame.finite.shape
         ((84, 62), (52, 62))
     """
-    gray, finite, clean = _clean(image)
+    gray, finite, clean = _replace_nonfinite(image)
     pyramid = (gray, *gaussian_pyramid(lax.stop_gradient(gray), levels=levels)[1:])
     padded = [jnp.pad(level, margin, mode="edge") for level in pyramid]
     atlas = jnp.zeros(_atlas_shape(image.shape, levels, margin), dtype=gray.dtype)
     for level, corner in zip(padded, _corners(image.shape, levels, margin), strict=True):
         atlas = lax.dynamic_update_slice(atlas, level, (corner[1], corner[0]))
-    return Frame(atlas, jnp.pad(finite, margin, mode="edge"), clean, _spread(pyramid), image.shape, levels, margin)
+    return Frame(atlas, jnp.pad(finite, margin, mode="edge"), clean, _quantiles(pyramid), image.shape, levels, margin)
 
 
-def _clean(image: Float[Array, "h w"] | UInt8[Array, "h w"]):
-    """The image as numbers, which of its pixels were numbers, and whether all of them were."""
+def _replace_nonfinite(image: Float[Array, "h w"] | UInt8[Array, "h w"]):
+    """The image with finite values, the mask of originally finite pixels, and whether all of them were."""
     if not jnp.issubdtype(image.dtype, jnp.floating):
         return image.astype(jnp.float32), jnp.ones(image.shape, dtype=bool), jnp.array(True)
     finite = jnp.isfinite(image)
-    # One sum tells, unless it overflows; then every pixel is looked at.
+    # A single sum is finite if all pixels are, unless it overflows; only then all pixels are checked.
     clean = jnp.isfinite(jnp.sum(image))
 
     def mean_of_finite(_):
@@ -76,7 +76,7 @@ def _clean(image: Float[Array, "h w"] | UInt8[Array, "h w"]):
 
 
 def level_corners(frame: Frame) -> Int[Array, "l 2"]:
-    """Where (column, row) in the atlas pixel (0, 0) of each level lies.
+    """Position (column, row) in the atlas of pixel (0, 0) of each level.
 
     Example:
         >>> import jax.numpy as jnp
@@ -101,12 +101,12 @@ def level_sizes(frame: Frame) -> Int[Array, "l 2"]:
 def relative_gain(previous: Frame, current: Frame) -> Float[Array, ""]:
     """Contrast of one frame relative to another: slope of the regression of sorted gray levels on sorted gray levels.
 
-    The lowest and highest twentieth are left out, so that neither saturated pixels nor small new bright things count.
-    No pixels are matched: the scene may move.
+    The lowest and highest twentieth are ignored, for saturated pixels and new bright objects. No pixels are matched:
+    the scene may move.
 
     Args:
-        previous: Frame of contrast 1.
-        current: Frame whose contrast is asked for.
+        previous: Reference frame.
+        current: Frame of the contrast.
 
     Returns:
         The gain, between 1/8 and 8; 1 where a frame has no contrast.
@@ -118,18 +118,18 @@ def relative_gain(previous: Frame, current: Frame) -> Float[Array, ""]:
         >>> round(float(relative_gain(first, second)), 2)
         0.6
     """
-    cut = previous.spread.shape[0] // 20
-    first, second = (frame.spread[cut : frame.spread.shape[0] - cut] for frame in (previous, current))
+    cut = previous.quantiles.shape[0] // 20
+    first, second = (frame.quantiles[cut : frame.quantiles.shape[0] - cut] for frame in (previous, current))
     first, second = first - jnp.mean(first), second - jnp.mean(second)
     below, above = jnp.sum(first * first), jnp.sum(first * second)
-    # A spread of less than a hundredth of a gray level a sample is none.
+    # A standard deviation below a hundredth of a gray level is no contrast.
     some = (below > 1e-4 * first.size) & (above > 1e-4 * first.size)
     gain = jnp.where(some, above, 1.0) / jnp.where(some, below, 1.0)
     return lax.stop_gradient(jnp.clip(gain, 0.125, 8.0))
 
 
-def _spread(pyramid: tuple[Float[Array, "_ _"], ...]) -> Float[Array, " s"]:
-    """Sorted gray levels, evenly taken, of a level smooth enough to have little noise."""
+def _quantiles(pyramid: tuple[Float[Array, "_ _"], ...]) -> Float[Array, " s"]:
+    """Sorted gray levels of evenly spaced samples of a coarse level, which has little noise."""
     level = pyramid[min(2, len(pyramid) - 1)]
     stride = max(1, round((level.size / _SAMPLES) ** 0.5))
     return jnp.sort(lax.stop_gradient(level)[::stride, ::stride].reshape(-1))
@@ -141,7 +141,7 @@ def _shapes(shape: tuple[int, int], levels: int) -> list[tuple[int, int]]:
 
 
 def _corners(shape: tuple[int, int], levels: int, margin: int) -> list[tuple[int, int]]:
-    """Where (column, row) each padded level starts in the atlas."""
+    """Position (column, row) of each padded level in the atlas."""
     corners, column = [(0, 0)], 0
     for _, width in _shapes(shape, levels)[1:]:
         corners.append((column, shape[0] + 2 * margin))

@@ -1,4 +1,4 @@
-"""Patches summed against a window once a pixel cell: Gauss-Newton steps within the cell then touch no pixel.
+"""Sums of products of patches and windows per pixel cell, for Gauss-Newton steps without access to pixels.
 
 Bilinear interpolation is linear in the image: `I(x + c + f) = sum_ij w_ij(f) I(x + c + (i, j))` for a whole pixel c
 and a fraction f in the unit cell. So the sums of template times image at any f are the same mean of four sums, and one
@@ -18,7 +18,7 @@ class PatchSums(eqx.Module):
     """Centered sums of n patches; the three maps of a template are its slopes right and down and its values.
 
     Attributes:
-        gram: Products of the template's maps.
+        gram: Products of the template's maps with each other.
         cross: Products of the template's maps with the image at the four corners (down, right) of the pixel cell.
     """
 
@@ -27,7 +27,7 @@ class PatchSums(eqx.Module):
 
 
 class CellSolution(eqx.Module):
-    """Where in the cell a template fits.
+    """Solution within a cell.
 
     Attributes:
         fraction: Position (right, down) from the cell's corner; outside the unit cell it is extrapolated.
@@ -49,7 +49,7 @@ def cut_window(image: Float[Array, "h w"], corner: Int[Array, "n 2"], size: int)
         [-2.0, -1.0, 0.0, 1.0]
     """
     windows = slice_windows(image, corner, (size + 1, size + 1))
-    # Sums of products of large numbers would lose digits in float32.
+    # Relative to the center, since sums of large products are inaccurate in float32.
     center = windows[:, (size + 1) // 2, (size + 1) // 2]
     return jnp.transpose(windows - center[:, None, None], (1, 2, 0))
 
@@ -57,15 +57,15 @@ def cut_window(image: Float[Array, "h w"], corner: Int[Array, "n 2"], size: int)
 def sum_patches(
     source: Float[Array, "r r n"], fraction: Float[Array, "2 n"], window: Float[Array, "q q n"]
 ) -> PatchSums:
-    """Sums over all pixels of each patch, one row at a time so that everything stays in the cache.
+    """Sums over all pixels of each patch, one row at a time to fit the cache.
 
     Args:
         source: Windows of the first image with one pixel more to the left and above, two to the right and below.
-        fraction: How far (right, down) the templates lie from the source's pixels.
+        fraction: Offset (right, down) of the templates from the source's pixels.
         window: Windows of the second image with one pixel more to the right and below.
 
     Returns:
-        Sums of products of template and window, both freed of their means.
+        Sums of products of template and window, both less their means.
 
     Example:
         >>> import jax.numpy as jnp
@@ -78,7 +78,7 @@ def sum_patches(
     template = compute_once(shift, source, fraction)
     inner = template[1:-1, 1:-1]
     slopes = 0.5 * (template[1:-1, 2:] - template[1:-1, :-2]), 0.5 * (template[2:, 1:-1] - template[:-2, 1:-1])
-    # The last map, of ones, gives the sums that free all others of their means.
+    # The last map, of ones, gives the sums for subtraction of the means.
     maps = jnp.stack([*slopes, inner, jnp.ones_like(inner)], axis=2)
 
     def add_row(row, sums):
@@ -96,7 +96,7 @@ def sum_patches(
 
 
 def shift(pixels: Float[Array, "p q n"], fraction: Float[Array, "2 n"]) -> Float[Array, "p2 q2 n"]:
-    """Shifts each patch by its fraction (right, down) of a pixel, bilinearly; it loses its last row and column.
+    """Shifts each patch by its fraction (right, down) of a pixel, bilinearly; without its last row and column.
 
     Example:
         >>> import jax.numpy as jnp
@@ -111,10 +111,10 @@ def shift(pixels: Float[Array, "p q n"], fraction: Float[Array, "2 n"]) -> Float
 def regress(
     sums: PatchSums, fraction: Float[Array, "2 n"], gains: Float[Array, "2 *n"]
 ) -> tuple[Float[Array, "2 n"], Float[Array, " n"]]:
-    """Gauss-Newton step and gain at a position in the cell, the gain held between two bounds.
+    """Gauss-Newton step and gain at a position in the cell, the gain clipped to two bounds.
 
-    Minimizes `sum (I - g T - b - g s d)^2` over d, g and b with slopes s of the template; a gain beyond its bounds is
-    put on the bound and the others follow.
+    Minimizes `sum (I - g T - b - g s d)^2` over d, g and b with slopes s of the template; for a gain beyond its bounds,
+    the others are those at the bound.
 
     Args:
         sums: Sums of the patches.
@@ -135,7 +135,7 @@ def regress(
     x, y, z = at_fraction(sums, fraction)
     determinant, regular = determinant_of(sums)
     safe = jnp.where(regular, determinant, 1.0)
-    # Share of the template that its slopes do not explain, and of the image.
+    # Parts of the template and of the image that the slopes do not explain.
     along_u, along_v = (c * p - b * q) / safe, (a * q - b * p) / safe
     rest = e - along_u * p - along_v * q
     free = jnp.where(regular & (rest > 1e-6 * e), z - along_u * x - along_v * y, 1.0)
@@ -195,7 +195,7 @@ def solve_cell(
 
 
 def split_pixel(coordinate: Float[Array, "n 2"]) -> tuple[Int[Array, "n 2"], Float[Array, "n 2"]]:
-    """Whole pixels and the fraction beyond them.
+    """Splits coordinates into whole pixels and fractions.
 
     Example:
         >>> import jax.numpy as jnp

@@ -1,22 +1,22 @@
-"""How points are tracked, and what comes out."""
+"""Options and results of KLT tracking."""
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
 
 class Klt(eqx.Module):
-    """How points are tracked.
+    """Options of KLT tracking.
 
     Attributes:
         size: Odd side of a patch, px.
         levels: Pyramid levels, the full image included.
-        gain_freedom: A patch's gain lies within this factor of the gain of the whole image.
-        min_correlation: Least correlation of patches of a trusted point.
-        max_forward_backward: Greatest distance at which tracking back may miss the point, px; None tracks forward only.
-        least_sigma: Standard deviation of what noise does not show (interpolation, deformed patches), px.
-        max_rounds: Pixel cells a point may visit on each level.
-        num_steps: Gauss-Newton steps in a cell; they touch no pixel.
-        chunk: Points that are worked on at a time: those that fit the cache; raise it to thousands on a GPU.
+        gain_freedom: Greatest ratio of a patch's gain to the gain of the whole image, either way.
+        min_correlation: Least correlation of patches of a valid point.
+        max_forward_backward: Greatest forward-backward error, px; None tracks forward only.
+        least_sigma: Standard deviation of errors other than noise (interpolation, deformed patches), px.
+        max_rounds: Greatest number of pixel cells on each level.
+        num_steps: Gauss-Newton steps in a cell.
+        chunk: Points that are processed at a time, to fit the cache; thousands on a GPU.
     """
 
     size: int = eqx.field(static=True, default=21)
@@ -37,16 +37,16 @@ class Klt(eqx.Module):
 
 
 class Tracked(eqx.Module):
-    """Where points of one image are seen in another.
+    """Points of one image tracked in another.
 
     Attributes:
-        points: Pixels (right, down) in the current image; the guess where `ok` is False.
-        ok: Whether the result can be trusted.
+        points: Pixels (right, down) in the current image; the initial value where `ok` is False.
+        ok: Whether the result is valid.
         residual: Root mean square of `I - g T - b` over the patch, gray levels.
         covariance: Of the pixels, px^2.
         gain: Contrast of the patch relative to the previous image.
         correlation: Of the two patches.
-        forward_backward: Distance at which tracking back misses the point, px; zero where it was not asked for.
+        forward_backward: Forward-backward error, px; zero where not computed.
     """
 
     points: Float[Array, "n 2"]

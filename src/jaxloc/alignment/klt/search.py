@@ -1,4 +1,4 @@
-"""Coarse-to-fine search: a fixed number of slots in which every point works on its own level."""
+"""Coarse-to-fine search in a fixed number of slots, each point at its own pyramid level."""
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ from jaxloc.alignment.klt.records import Klt
 
 
 class Found(eqx.Module):
-    """Where points were found, with the sums of their patches there.
+    """Found positions with the sums of their patches.
 
     Attributes:
         cell: Whole pixel of the first pixel of the patch in the second frame.
@@ -28,7 +28,7 @@ class Found(eqx.Module):
 
 
 class _Slots(eqx.Module):
-    """Points in work, each on its own level, those that wait, and a log of those that are done."""
+    """Points in progress, each at its own level, the queue, and the log of finished ones."""
 
     index: Int[Array, " c"]
     level: Int[Array, " c"]
@@ -48,22 +48,22 @@ def search(
     gains: Float[Array, " 2"],
     options: Klt,
 ) -> Found:
-    """Displacements of all points from the coarsest level to the finest; they have no gradients.
+    """Displacements of all points from the coarsest level to the finest, without derivatives.
 
-    A round cuts the patches of all slots, each from the level its point has reached, and moves the points within their
-    pixel cells. A point that settles goes down a level; one that is through leaves its slot to the next. So none waits
-    for the slowest, all levels and points share one small program, and what it needs stays in the cache.
+    A round cuts the patches of all slots, each from the current level of its point, and moves the points within their
+    pixel cells. A converged point goes to the next level; a finished one is replaced by the next in the queue. So no
+    point waits for the slowest, all levels and points share one small program, and its data fit the cache.
 
     Args:
         previous: First frame.
         current: Second frame.
         points: Pixels of the first frame; finite.
-        offset: Guessed displacements, px.
+        offset: Initial displacements, px.
         gains: Least and greatest gain.
         options: Patches, rounds and slots.
 
     Returns:
-        Where the points were found.
+        The found positions.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -84,20 +84,20 @@ def search(
     if count == 0:
         return empty
     corners, sizes = level_corners(previous), level_sizes(previous)
-    start = offset * 0.5**top
+    initial = offset * 0.5**top
 
     def advance(slots: _Slots) -> _Slots:
         busy = slots.index < count
         index = jnp.minimum(slots.index, count - 1)
         level = slots.level
         uv = points[index] * jnp.exp2(-level.astype(points.dtype))[:, None]
-        moved, settled, fit = _round(
+        moved, converged, fit = _round(
             previous.atlas, current.atlas, uv, slots.offset, gains, corners[level], sizes[level], level, options
         )
-        through = settled | (slots.rounds + 1 >= options.max_rounds)
-        done = busy & through & (level == 0)
-        # A scatter is slow on a processor. The finished go to the front, and all are appended as one block, of which
-        # the next block overwrites the unfinished.
+        finished = converged | (slots.rounds + 1 >= options.max_rounds)
+        done = busy & finished & (level == 0)
+        # A scatter is slow on a CPU. Finished points are moved to the front, and all are appended as one block, whose
+        # unfinished part the next block overwrites.
         first = jnp.argsort(~done)
 
         def append(log, new):
@@ -105,12 +105,12 @@ def search(
 
         following = slots.waiting + jnp.cumsum(done, dtype=jnp.int32) - 1
         index = jnp.where(done, jnp.minimum(following, count), slots.index)
-        fresh = start[jnp.minimum(index, count - 1)]
-        onward = jnp.where((through & (level > 0))[:, None], 2.0 * moved, moved)
+        fresh = initial[jnp.minimum(index, count - 1)]
+        onward = jnp.where((finished & (level > 0))[:, None], 2.0 * moved, moved)
         return _Slots(
             index,
-            jnp.where(done, top, jnp.where(through, jnp.maximum(level - 1, 0), level)),
-            jnp.where(through, 0, slots.rounds + 1),
+            jnp.where(done, top, jnp.where(finished, jnp.maximum(level - 1, 0), level)),
+            jnp.where(finished, 0, slots.rounds + 1),
             jnp.where(done[:, None], fresh, onward),
             slots.waiting + jnp.sum(done, dtype=jnp.int32),
             slots.finished + jnp.sum(done, dtype=jnp.int32),
@@ -120,19 +120,19 @@ def search(
 
     line, none = jnp.arange(width, dtype=jnp.int32), jnp.zeros(width, dtype=jnp.int32)
     log = jnp.full(count + width, count, dtype=jnp.int32)
-    slots = _Slots(line, none + top, none, start[:width], jnp.int32(width), jnp.int32(0), log, empty)
+    slots = _Slots(line, none + top, none, initial[:width], jnp.int32(width), jnp.int32(0), log, empty)
     slots = lax.while_loop(lambda slots: slots.finished < count, advance, slots)
     where = jnp.argsort(slots.order[:count])
     return jax.tree.map(lambda log: log[where], slots.found)
 
 
 def _round(previous, current, uv, offset, gains, corner, size, level, options: Klt):
-    """Moves points within the pixel cells in which they lie: their offsets, who has settled, and how they fit."""
+    """Moves points within their pixel cells: offsets, which have converged, and their sums."""
     dtype = previous.dtype
     last = (size - 1).astype(uv.dtype)
     uv = jnp.clip(uv, 0.0, last)
     half = options.size // 2
-    # The border is repeated, so that points may lie anywhere on the level.
+    # The border is repeated, so that points may be anywhere on the level.
     at, below = split_pixel(uv - (half + 1))
     source = cut_window(previous, at + corner, options.size + 2)
     target = jnp.clip(uv + offset, 0.0, last)
@@ -141,10 +141,10 @@ def _round(previous, current, uv, offset, gains, corner, size, level, options: K
     sums = sum_patches(source, below.T.astype(dtype), window)
     solution = solve_cell(sums, fraction.T.astype(dtype), gains, options.num_steps)
     beyond = jnp.max(jnp.abs(solution.fraction - 0.5), axis=0) - 0.5
-    # What is just beyond its cell on a coarse level is near enough for the next.
-    settled = (beyond < jnp.where(level > 0, 0.3, 0.05)) & (solution.step < 0.05)
+    # Just beyond the cell is accurate enough at coarse levels.
+    converged = (beyond < jnp.where(level > 0, 0.3, 0.05)) & (solution.step < 0.05)
     moved = jnp.clip(cell.astype(uv.dtype) + half + solution.fraction.T.astype(uv.dtype), 0.0, last) - uv
     moved = jnp.where(solution.regular[:, None], moved, offset)
     width = uv.shape[0]
     fit = Found(cell, solution.fraction.T, sums.gram.reshape(9, width).T, sums.cross.reshape(12, width).T)
-    return moved, settled | ~solution.regular, fit
+    return moved, converged | ~solution.regular, fit

@@ -1,4 +1,4 @@
-"""Tracking from image to image, between prepared frames, and through a video."""
+"""KLT tracking between two images, between prepared frames, and through a video."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,10 +14,10 @@ from jaxloc.images.interpolation import inside_image
 
 @eqx.filter_jit
 def prepare(image: Float[Array, "h w"] | UInt8[Array, "h w"], *, options: Klt = Klt()) -> Frame:  # noqa: B008
-    """Builds what tracking needs of an image, so that a video's frames are each prepared once.
+    """Preprocesses an image for tracking, so that each frame of a video is prepared once.
 
     Args:
-        image: Gray image of any dtype; integers become float32.
+        image: Grayscale image of any dtype; integers become float32.
         options: Patch size and levels. Small images get fewer levels.
 
     Returns:
@@ -52,22 +52,22 @@ def track(
     """Tracks points from one image to the next.
 
     Minimizes `sum (I(x + d) - g T(x) - b)^2` over d, gain g and bias b of every patch T of the previous image, from the
-    coarsest level of a pyramid to the finest, with the template's derivatives (inverse composition). The gain stays
-    near that of the whole image, which is known beforehand from the spread of gray levels: a free gain would shrink
-    the basin. Gradients with respect to both images and the points are those of the solution (implicit function
-    theorem).
+    coarsest level of a pyramid to the finest, with the template's derivatives (inverse composition). The gain is near
+    that of the whole image, which is estimated from the distributions of gray levels: a free gain would reduce the
+    basin of convergence. Gradients with respect to both images and the points are those of the solution (implicit
+    function theorem).
 
     Args:
-        previous: Gray image; integers are taken as float32.
+        previous: Grayscale image; integers become float32.
         current: Image of the same shape.
         points: Pixels (right, down) of the previous image.
-        initial: Guesses in the current image; without them, points stay where they were.
+        initial: Positions in the current image; by default those in the previous one.
         valid: Points to be tracked; others are not `ok`.
-        options: Patches, pyramid, trust.
+        options: Patches, pyramid and thresholds.
 
     Returns:
-        Pixels in the current image with residual, covariance, gain and trust. The covariance is `s^2 / g^2 H^-1` with
-        s^2 the residual's variance and H the structure matrix free of gain and bias.
+        Pixels in the current image with residual, covariance and gain. The covariance is `s^2 / g^2 H^-1` with
+        s^2 the residual's variance and H the structure matrix with gain and bias projected out.
 
     Raises:
         ValueError: The images differ in shape, or are smaller than a patch.
@@ -98,7 +98,7 @@ def track_frames(
     valid: Bool[Array, " n"] | None = None,
     options: Klt = Klt(),  # noqa: B008 (an immutable record)
 ) -> Tracked:
-    """Tracks points between frames of `prepare`; all else is as in `track`.
+    """Tracks points between frames of `prepare`; see `track`.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -108,30 +108,30 @@ def track_frames(
         True
     """
     if previous.shape != current.shape:
-        raise ValueError(f"track: images of one shape are needed, not {previous.shape} and {current.shape}.")
+        raise ValueError(f"track: images must have the same shape, not {previous.shape} and {current.shape}.")
     if min(previous.margin, current.margin) < options.size // 2 + 2 or previous.levels != current.levels:
-        raise ValueError("track_frames: prepare both frames with the options that they are tracked with.")
+        raise ValueError("track_frames: prepare both frames with the same options.")
     valid = jnp.ones(points.shape[:1], dtype=bool) if valid is None else valid
-    guess = points if initial is None else initial
+    first = points if initial is None else initial
     middle = 0.5 * jnp.array([previous.shape[1] - 1, previous.shape[0] - 1], dtype=points.dtype)[None, :]
-    guess = lax.stop_gradient(jnp.where(jnp.all(jnp.isfinite(guess), axis=1)[:, None], guess, middle))
+    first = lax.stop_gradient(jnp.where(jnp.all(jnp.isfinite(first), axis=1)[:, None], first, middle))
     usable = valid & inside_image(points, previous.shape)
-    start = jnp.where(usable[:, None], points, middle)
+    source = jnp.where(usable[:, None], points, middle)
     gains = relative_gain(previous, current) * jnp.array([1.0 / options.gain_freedom, options.gain_freedom])
-    near = search(previous, current, start, jnp.where(usable[:, None], guess - start, 0.0), gains, options)
-    found = conclude(previous, current, start, near, usable, gains, options)
+    near = search(previous, current, source, jnp.where(usable[:, None], first - source, 0.0), gains, options)
+    found = conclude(previous, current, source, near, usable, gains, options)
     if options.max_forward_backward is not None:
-        found = _check_backward(previous, current, start, found, gains, options)
-    uv = jnp.where(found.ok[:, None], found.points, guess)
+        found = _check_backward(previous, current, source, found, gains, options)
+    uv = jnp.where(found.ok[:, None], found.points, first)
     return eqx.tree_at(lambda tracked: tracked.points, found, uv)
 
 
-def _check_backward(previous: Frame, current: Frame, start, found: Tracked, gains, options: Klt) -> Tracked:
-    """Tracks the found points back, from no guess, and trusts those that come home."""
-    uv = lax.stop_gradient(jnp.where(found.ok[:, None], found.points, start))
-    home = search(current, previous, uv, jnp.zeros_like(uv), 1.0 / gains[::-1], options)
-    apart = home.cell.astype(uv.dtype) + home.fraction.astype(uv.dtype) + options.size // 2 - start
-    missed = jnp.where(found.ok, jnp.linalg.norm(lax.stop_gradient(apart), axis=1), 0.0).astype(found.residual.dtype)
+def _check_backward(previous: Frame, current: Frame, source, found: Tracked, gains, options: Klt) -> Tracked:
+    """Forward-backward test: tracks the found points back and rejects those with a large error."""
+    uv = lax.stop_gradient(jnp.where(found.ok[:, None], found.points, source))
+    back = search(current, previous, uv, jnp.zeros_like(uv), 1.0 / gains[::-1], options)
+    error = back.cell.astype(uv.dtype) + back.fraction.astype(uv.dtype) + options.size // 2 - source
+    missed = jnp.where(found.ok, jnp.linalg.norm(lax.stop_gradient(error), axis=1), 0.0).astype(found.residual.dtype)
     ok = found.ok & (missed <= options.max_forward_backward)
     return eqx.tree_at(lambda tracked: (tracked.ok, tracked.forward_backward), found, (ok, missed))
 
@@ -143,15 +143,15 @@ def track_sequence(
     *,
     options: Klt = Klt(),  # noqa: B008 (an immutable record)
 ) -> Tracked:
-    """Follows points of the first image through a video, from frame to frame.
+    """Tracks points of the first image through a video, from frame to frame.
 
     Args:
         images: The video.
         points: Pixels of its first image.
-        options: Patches, pyramid, trust.
+        options: Patches, pyramid and thresholds.
 
     Returns:
-        One row of results for every image but the first; a lost point stays lost.
+        Results for every image but the first; lost points are not tracked again.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -167,5 +167,5 @@ def track_sequence(
         found = track_frames(frame, following, uv, valid=ok, options=options)
         return (following, found.points, found.ok), found
 
-    start = prepare(images[0], options=options), points, jnp.ones(points.shape[0], dtype=bool)
-    return lax.scan(advance, start, images[1:])[1]
+    first = prepare(images[0], options=options), points, jnp.ones(points.shape[0], dtype=bool)
+    return lax.scan(advance, first, images[1:])[1]

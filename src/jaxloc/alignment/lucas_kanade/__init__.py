@@ -1,4 +1,4 @@
-"""Lucas-Kanade: a template laid upon an image by the derivatives of their gray levels."""
+"""Lucas-Kanade image alignment: formulations, descents, brightness models, pyramids and covariance."""
 
 from jaxloc.alignment.lucas_kanade.align import align
 from jaxloc.alignment.lucas_kanade.brightness import Bias, Brightness, Correlation, GainBias, Unchanged

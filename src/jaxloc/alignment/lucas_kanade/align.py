@@ -1,4 +1,4 @@
-"""Lucas and Kanade's alignment of a template with an image, under any warp."""
+"""Lucas-Kanade alignment of a template with an image under a parametric warp."""
 
 from typing import Any
 
@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc import _tree as tree
-from jaxloc.alignment.lucas_kanade.covariance import AlignmentEquations, Evidence, conclude
-from jaxloc.alignment.lucas_kanade.iteration import Descended, Limits, descend
+from jaxloc.alignment.lucas_kanade.covariance import AlignmentData, AlignmentEquations, conclude
+from jaxloc.alignment.lucas_kanade.iteration import Limits, SearchResult, descend
 from jaxloc.alignment.lucas_kanade.normal_equations import zero_brightness
 from jaxloc.alignment.lucas_kanade.options import LucasKanade
 from jaxloc.alignment.lucas_kanade.pyramid_level import Frame, Level
@@ -29,31 +29,31 @@ def align(
     weights: Num[Array, "p q"] | Bool[Array, "p q"] | None = None,
     sigma: Any = None,
 ) -> Estimate:
-    """Finds the warp W under which the image looks like the template: ``image(W(x)) ~ gain template(x) + bias``.
+    """Finds the warp W that aligns an image with a template: ``image(W(x)) ~ gain template(x) + bias``.
 
     Minimizes ``sum_x w(x) rho((image(W(x)) - gain template(x) - bias) / sigma)`` over the warp, gain and bias being
     eliminated in closed form, from coarse to fine. The value has the derivatives of the solution with respect to image,
     template and weights (implicit function theorem), in forward and reverse mode.
 
     Args:
-        image: gray levels, bytes or numbers; nan where there is no image.
-        template: gray levels; nan where it does not count.
-        warp: its class: `Translation`, `Euclidean`, `Similarity`, `Affine` or `Homography`.
-        initial: where to start, a warp of any class from template pixels to image pixels; the identity by default.
-        method: formulation, descent, brightness, scales, kernel, limits.
+        image: gray levels; nan where unknown.
+        template: gray levels; nan where unknown.
+        warp: class of the warp: `Translation`, `Euclidean`, `Similarity`, `Affine` or `Homography`.
+        initial: a warp of any class from template pixels to image pixels; the identity by default.
+        method: formulation, descent, brightness, scales, kernel and limits.
         weights: of the template's pixels, or a mask.
-        sigma: standard deviation of the image's noise, gray levels; measured from the residual if not given.
+        sigma: standard deviation of the image's noise, gray levels; estimated from the residual if not given.
 
     Returns:
-        Estimate of the warp, with the covariance of its tangent (``W @ exp(d)``, pixels). It holds the noise of both
-        images, as far as interpolation lets it through; it knows nothing of a warp that is too simple for the scene.
+        Estimate of the warp, with the covariance of its tangent (``W @ exp(d)``, pixels). It accounts for the noise of
+        both images after interpolation, but not for a warp that is too simple for the scene.
         ``ok`` is False when the texture leaves directions undetermined (a flat template, a single edge), when the
-        search did not settle, or when the result contradicts the model: too little of the template on the image, too
+        search did not converge, or when the result contradicts the model: too little of the template in the image, too
         little correlation, a template folded over. The value is finite in any case.
 
     Raises:
         ValueError: an image has not two axes, weights have another shape than the template, or the formulation does
-            not know the warp.
+            not support the warp.
 
     References:
         Lucas and Kanade, 1981; Baker and Matthews, "Lucas-Kanade 20 years on", IJCV 56(3), 2004 [K-12, K-20, K-21,
@@ -64,18 +64,18 @@ def align(
         >>> u, v = jnp.meshgrid(jnp.arange(60.0), jnp.arange(50.0))
         >>> scene = lambda u, v: 100 + 40 * jnp.sin(0.3 * u) * jnp.cos(0.25 * v)
         >>> image, template = 0.7 * scene(u, v) + 20, scene(u + 12.3, v + 9.6)[:32, :32]
-        >>> start = jl.images.Translation(jnp.array([11.0, 11.0]))
-        >>> fit = jl.alignment.lucas_kanade.align(image, template, jl.images.Translation, start)
+        >>> initial = jl.images.Translation(jnp.array([11.0, 11.0]))
+        >>> fit = jl.alignment.lucas_kanade.align(image, template, jl.images.Translation, initial)
         >>> bool(fit.ok), [round(x, 1) for x in fit.value.translation.tolist()]
         (True, [12.3, 9.6])
     """
-    # Numbers become arrays here, so that no value is compiled in; all else happens in one program.
+    # Numbers become arrays here, so that new values do not compile anew.
     arrays = (None if given is None else jnp.asarray(given) for given in (image, template, weights, sigma))
     return _align(*arrays, warp, initial, method)
 
 
-def take(image: Any, template: Any, weights: Any, sigma: Any, method: LucasKanade) -> Evidence:
-    """The images as numbers of one dtype, with their weights.
+def prepare(image: Any, template: Any, weights: Any, sigma: Any, method: LucasKanade) -> AlignmentData:
+    """The images as arrays of one dtype, with their weights.
 
     Raises:
         ValueError: shapes that do not fit.
@@ -86,53 +86,59 @@ def take(image: Any, template: Any, weights: Any, sigma: Any, method: LucasKanad
     given = jnp.ones_like(template) if weights is None else jnp.asarray(weights).astype(template.dtype)
     sigma = None if sigma is None else jnp.asarray(sigma, template.dtype)
     frame = Frame.of(template.shape, method.normalized)
-    return Evidence(as_gray(image, template.dtype), template, given, sigma, frame, method)
+    return AlignmentData(as_gray(image, template.dtype), template, given, sigma, frame, method)
 
 
-def start_of(warp: type[Warp], initial: Warp | None, template: Any) -> Warp:
-    """The start as a member of the group, in the template's dtype."""
+def initial_warp(warp: type[Warp], initial: Warp | None, template: Any) -> Warp:
+    """The initial value as a warp of the given class, in the template's dtype."""
     dtype = as_gray(template).dtype
-    start = warp.identity(dtype) if initial is None else warp.of(initial)
-    return jax.tree.map(lambda leaf: leaf.astype(dtype), start)
+    first = warp.identity(dtype) if initial is None else warp.of(initial)
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), first)
 
 
 @eqx.filter_jit
 def _align(
     image: Any, template: Any, weights: Any, sigma: Any, warp: type[Warp], initial: Any, method: Any
 ) -> Estimate:
-    evidence = take(image, template, weights, sigma, method)
-    start, finite = finite_start(start_of(warp, initial, template))
-    detached = jax.lax.stop_gradient(evidence)
+    data = prepare(image, template, weights, sigma, method)
+    first, finite = finite_warp(initial_warp(warp, initial, template))
+    detached = jax.lax.stop_gradient(data)
     levels = detached.levels()
-    found = search(detached, levels, evidence.frame.normalize(start), zero_brightness(levels[0]))
-    return estimate(evidence, found, finite)
+    found = search(detached, levels, data.frame.normalize(first), zero_brightness(levels[0]))
+    return finish(data, found, finite)
 
 
-def finite_start(start: Warp) -> tuple[Warp, Bool[Array, ""]]:
-    """The start without gradient, the identity if it has numbers that are none, and whether it has not."""
-    finite = jnp.all(jnp.isfinite(start.matrix()))
-    other = type(start).identity(start.matrix().dtype)
-    safe = tree.where(finite, start, other)
+def finite_warp(warp: Warp) -> tuple[Warp, Bool[Array, ""]]:
+    """The warp without gradient, the identity if it is not finite, and whether it is finite."""
+    finite = jnp.all(jnp.isfinite(warp.matrix()))
+    other = type(warp).identity(warp.matrix().dtype)
+    safe = tree.where(finite, warp, other)
     return jax.lax.stop_gradient(safe), finite
 
 
-def search(evidence: Evidence, levels: list[Level], warp: Warp, brightness: Float[Array, " k"]) -> Descended:
-    """From coarse to fine, over given levels."""
-    method, count, moved = evidence.method, jnp.zeros((), jnp.int32), jnp.zeros((), warp.matrix().dtype)
+def search(data: AlignmentData, levels: list[Level], warp: Warp, brightness: Float[Array, " k"]) -> SearchResult:
+    """Iterations from coarse to fine over given levels."""
+    method, count, moved = data.method, jnp.zeros((), jnp.int32), jnp.zeros((), warp.matrix().dtype)
     for number, level in enumerate(levels):
         last = number == len(levels) - 1
         limits = Limits(method.max_steps, method.tolerance * (1.0 if last else 10.0 * level.factor))
-        found = descend(level, warp, brightness, evidence.matching, method.descent, limits=limits)
+        found = descend(level, warp, brightness, data.matching, method.descent, limits=limits)
         warp, brightness, moved = found.warp, found.brightness, found.moved
         count = count + found.num_steps
-    return Descended(warp, brightness, moved, count)
+    return SearchResult(warp, brightness, moved, count)
 
 
-def estimate(evidence: Evidence, found: Descended, finite: Bool[Array, ""]) -> Estimate:
-    """Judges where a search ended, and gives it the derivatives of a solution."""
-    judged = conclude(jax.lax.stop_gradient(evidence), found.warp, found.brightness, found.moved, finite)
-    followed = attach_gradient(found.warp, AlignmentEquations(evidence, found.brightness), judged.ok)
-    value = evidence.frame.denormalize(followed)
+def finish(data: AlignmentData, found: SearchResult, finite: Bool[Array, ""]) -> Estimate:
+    """Estimate from the result of a search, with covariance, status and the derivatives of the solution."""
+    conclusion = conclude(jax.lax.stop_gradient(data), found.warp, found.brightness, found.moved, finite)
+    attached = attach_gradient(found.warp, AlignmentEquations(data, found.brightness), conclusion.ok)
+    value = data.frame.denormalize(attached)
     return Estimate(
-        value, judged.covariance, judged.cost, judged.ok, found.num_steps, judged.status, judged.information
+        value,
+        conclusion.covariance,
+        conclusion.cost,
+        conclusion.ok,
+        found.num_steps,
+        conclusion.status,
+        conclusion.information,
     )

@@ -1,4 +1,4 @@
-"""How gray levels may differ between two aligned images: what is solved for beside the warp and then dropped."""
+"""Brightness models of two aligned images, whose coefficients are eliminated from the normal equations."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -19,7 +19,7 @@ class Brightness(eqx.Module):
 
 
 class Unchanged(Brightness):
-    """Gray levels stay as they are: the sum of squared differences."""
+    """Equal gray levels: sum of squared differences."""
 
     correlating: ClassVar[bool] = False
 
@@ -29,7 +29,7 @@ class Unchanged(Brightness):
 
 
 class Bias(Brightness):
-    """All gray levels move by one number."""
+    """A constant offset of all gray levels."""
 
     correlating: ClassVar[bool] = False
 
@@ -39,7 +39,7 @@ class Bias(Brightness):
 
 
 class GainBias(Brightness):
-    """Contrast and brightness change: least squares of what both leave.
+    """Gain and bias by least squares.
 
     References:
         Baker, Gross, Matthews, "Lucas-Kanade 20 years on: part 3", 2003, section 3.3 (project-out) [K-22].
@@ -53,10 +53,10 @@ class GainBias(Brightness):
 
 
 class Correlation(Brightness):
-    """Contrast and brightness change: the greatest zero-mean normalized correlation (ECC).
+    """Gain and bias by the greatest zero-mean normalized correlation (ECC).
 
-    Least squares with a gain also like dark places of the image, where little contrast leaves little residual; the
-    correlation does not.
+    Least squares with a gain is biased towards image regions of low contrast, where residuals are small; the
+    correlation is not.
 
     References:
         Evangelidis and Psarakis, "Parametric image alignment using enhanced correlation coefficient maximization",

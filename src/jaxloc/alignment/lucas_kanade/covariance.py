@@ -1,8 +1,8 @@
-"""What an alignment is worth: its covariance, whether to believe it, and its derivatives.
+"""Covariance, status and derivatives of an alignment.
 
 The solution is a root of the estimating equations ``g(W) = sum w J (image(W(x)) - ...) = 0``, whose J may be the
-template's: not the derivative of any cost. So covariance and derivatives are those of a root: with ``S = dg/dW`` and
-the images' noise carried through g.
+template's: not the derivative of a cost. So covariance and derivatives are those of a root: with ``S = dg/dW`` and
+the images' noise propagated through g.
 """
 
 import equinox as eqx
@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxloc._linalg import matmul
 from jaxloc._xla import compute_once
 from jaxloc.alignment.lucas_kanade.formulations import through
-from jaxloc.alignment.lucas_kanade.interpolation_noise import passage
+from jaxloc.alignment.lucas_kanade.interpolation_noise import noise_transfer
 from jaxloc.alignment.lucas_kanade.normal_equations import Matching, Sums, gain_of, weigh, weight_slope
 from jaxloc.alignment.lucas_kanade.options import LucasKanade
 from jaxloc.alignment.lucas_kanade.pyramid_level import Frame, Level
@@ -24,8 +24,8 @@ from jaxloc.solvers.estimate import Status
 from jaxloc.solvers.implicit_gradient import Equations
 
 
-class Evidence(eqx.Module):
-    """The images, and how they are compared.
+class AlignmentData(eqx.Module):
+    """Images, weights, noise and options of an alignment.
 
     Attributes:
         image: gray levels.
@@ -33,7 +33,7 @@ class Evidence(eqx.Module):
         weights: of the template's pixels.
         sigma: standard deviation of the image's noise, or None.
         frame: of the template.
-        method: all choices.
+        method: options.
     """
 
     image: Float[Array, "h w"]
@@ -45,7 +45,7 @@ class Evidence(eqx.Module):
 
     @property
     def matching(self) -> Matching:
-        """How images are compared."""
+        """Options of the comparison."""
         method = self.method
         sigma = None if self.sigma is None else jnp.hypot(self.sigma, method.template_noise * self.sigma)
         return Matching(method.formulation, method.interpolation, method.loss, sigma)
@@ -63,15 +63,15 @@ class Evidence(eqx.Module):
         return Level.of(scaled, self.weights, self.frame, self.method.brightness, differentiate_image=forwards)
 
 
-class Judged(eqx.Module):
-    """The verdict on an alignment.
+class Conclusion(eqx.Module):
+    """Covariance and status of an alignment.
 
     Attributes:
         covariance: in the tangent of the warp of pixels.
         information: of the same tangent: the Gauss-Newton Hessian over the noise's variance.
         cost: sum of rho.
-        ok: whether to use it.
-        status: why.
+        ok: whether the estimate can be used.
+        status: a `Status` code.
     """
 
     covariance: Float[Array, "d d"]
@@ -91,17 +91,17 @@ def score(level: Level, warp: Warp, brightness: Float[Array, " k"], matching: Ma
 def slope(level: Level, warp: Warp, brightness: Float[Array, " k"], matching: Matching) -> Float[Array, "d d"]:
     """Derivative of the score along the warp's tangent ``W @ exp(d)``.
 
-    Exact for inverse formulations of least squares; for the others without the second derivatives of the image, which
-    noise spoils.
+    Exact for inverse formulations of least squares; for the others without second derivatives of the image, which are
+    sensitive to noise.
     """
     linear = matching.formulation.linearize(level, warp, matching.interpolation)
     weighted = weigh(level, linear, brightness, matching)
     steepest, columns = linear.steepest, level.columns
     sums = Sums.of(steepest, level, weighted.difference, weighted.weight)
-    projected = steepest - matmul(sums.leaks.T, columns)
+    projected = steepest - matmul(sums.steepest_brightness.T, columns)
     left = weighted.difference - matmul(sums.coefficients, columns)
-    seen = level.look_around(warp, matching.interpolation)
-    along = compute_once(lambda slope: through(warp, level, slope), seen.slope)
+    sampled = level.sample_with_interpolant_slope(warp, matching.interpolation)
+    along = compute_once(lambda slope: through(warp, level, slope), sampled.slope)
     right, down = warp.jacobian_components(level.u, level.v)
     change = along[0][None] * right + along[1][None] * down
     weight = weighted.weight + left * weight_slope(level, weighted, matching)
@@ -109,7 +109,7 @@ def slope(level: Level, warp: Warp, brightness: Float[Array, " k"], matching: Ma
 
 
 def exact_slope(level: Level, warp: Warp, brightness: Float[Array, " k"], matching: Matching) -> Float[Array, "d d"]:
-    """Derivative of the score along the warp's tangent, all of it."""
+    """Exact derivative of the score along the warp's tangent."""
     if matching.formulation.inverse and not level.correlating:
         return slope(level, warp, brightness, matching)
     zero = jnp.zeros(warp.dof, level.template.dtype)
@@ -120,20 +120,20 @@ class AlignmentEquations(Equations):
     """The estimating equations as equations of the warp, for derivatives of the solution by the images.
 
     Attributes:
-        evidence: the images.
+        data: the images.
         brightness: coefficients of its columns.
     """
 
-    evidence: Evidence
+    data: AlignmentData
     brightness: Float[Array, " k"]
 
     def residual(self, value: Warp) -> Float[Array, " d"]:
         """The score at the finest scale."""
-        return score(self.evidence.finest(), value, jax.lax.stop_gradient(self.brightness), self.evidence.matching)
+        return score(self.data.finest(), value, jax.lax.stop_gradient(self.brightness), self.data.matching)
 
     def solve(self, value: Warp, right: Float[Array, " d"], ok: Bool[Array, ""]) -> Float[Array, " d"]:
         """By the exact derivative of the score."""
-        matrix = exact_slope(self.evidence.finest(), value, self.brightness, self.evidence.matching)
+        matrix = exact_slope(self.data.finest(), value, self.brightness, self.data.matching)
         return _solve(matrix, right, ok)
 
     def move(self, value: Warp, delta: Float[Array, " d"]) -> Warp:
@@ -147,49 +147,49 @@ def _solve(matrix: Float[Array, "d d"], vector: Float[Array, " d"], ok: Bool[Arr
 
 
 def conclude(
-    evidence: Evidence, warp: Warp, brightness: Float[Array, " k"], moved: Float[Array, ""], finite: Bool[Array, ""]
-) -> Judged:
-    """Judges a solution at the finest scale.
+    data: AlignmentData, warp: Warp, brightness: Float[Array, " k"], moved: Float[Array, ""], finite: Bool[Array, ""]
+) -> Conclusion:
+    """Covariance and status of a solution at the finest scale.
 
     Args:
-        evidence: the images.
+        data: the images.
         warp: the solution, in normalized coordinates.
         brightness: coefficients of its columns.
         moved: length of the last step, px.
-        finite: whether the start was.
+        finite: whether the initial warp was.
     """
-    level, matching, method = evidence.finest(), evidence.matching, evidence.method
+    level, matching, method = data.finest(), data.matching, data.method
     match = _Match.at(level, warp, brightness, matching)
-    noise = _Noise.of(evidence, level, warp, match)
+    noise = _Noise.of(data, level, warp, match)
     bread = (exact_slope if level.correlating else slope)(level, warp, brightness, matching)
-    deficient = factor(match.hessian).deficient | (level.spread == 0) | ~jnp.all(jnp.isfinite(bread))
+    deficient = factor(match.hessian).deficient | (level.contrast == 0) | ~jnp.all(jnp.isfinite(bread))
     admissible = (match.coverage >= method.min_coverage) & (match.gain > 0.1) & _upright(level, warp)
     admissible = admissible & (match.correlation >= method.min_correlation)
-    settled = moved <= max(method.tolerance, 10.0 * _rounding(level))
+    converged = moved <= max(method.tolerance, 10.0 * _rounding(level))
     status = jnp.asarray(int(Status.CONVERGED))
     for failed, code in (
-        (~settled, Status.MAX_STEPS),
+        (~converged, Status.MAX_STEPS),
         (~admissible, Status.INADMISSIBLE),
         (deficient, Status.RANK_DEFICIENT),
         (~finite, Status.NONFINITE),
     ):
         status = jnp.where(failed, int(code), status)
     inverse = jnp.linalg.inv(jnp.where(deficient, jnp.eye(warp.dof, dtype=bread.dtype), bread))
-    spread = matmul(inverse, matmul(noise.of_score, inverse.T))
-    ok = (status == int(Status.CONVERGED)) & jnp.all(jnp.isfinite(spread))
-    to_pixels = evidence.frame.tangent_to_pixels(warp.dof, bread.dtype)
-    covariance = matmul(to_pixels, matmul(jnp.where(ok, spread, jnp.eye(warp.dof, dtype=spread.dtype)), to_pixels.T))
+    tangent = matmul(inverse, matmul(noise.of_score, inverse.T))
+    ok = (status == int(Status.CONVERGED)) & jnp.all(jnp.isfinite(tangent))
+    to_pixels = data.frame.tangent_to_pixels(warp.dof, bread.dtype)
+    covariance = matmul(to_pixels, matmul(jnp.where(ok, tangent, jnp.eye(warp.dof, dtype=tangent.dtype)), to_pixels.T))
     from_pixels = jnp.linalg.inv(to_pixels)
-    # In units of the template, whose contrast the image shows times the gain.
+    # In units of the template, whose contrast in the image is multiplied by the gain.
     contrast = match.gain**2 if method.formulation.inverse else jnp.ones_like(match.gain)
     information = matmul(from_pixels.T, matmul(match.hessian * contrast / noise.of_difference, from_pixels))
     rho = method.loss.rho(match.residual**2 / noise.of_difference)
     cost = jnp.sum(jnp.where(match.known, level.weight * rho, 0.0))
-    return Judged(_finite(covariance), _finite(information), _finite(cost), ok, status)
+    return Conclusion(_finite(covariance), _finite(information), _finite(cost), ok, status)
 
 
 class _Match(eqx.Module):
-    """The comparison at the solution, brightness solved for."""
+    """The comparison at the solution, with estimated brightness."""
 
     hessian: Float[Array, "d d"]
     steepest: Float[Array, "d n"]
@@ -207,7 +207,7 @@ class _Match(eqx.Module):
         weighted = weigh(level, linear, brightness, matching)
         weight, columns = weighted.weight, level.columns
         sums = Sums.of(linear.steepest, level, weighted.difference, weight)
-        steepest = (linear.steepest - matmul(sums.leaks.T, columns)) * weight[None]
+        steepest = (linear.steepest - matmul(sums.steepest_brightness.T, columns)) * weight[None]
         residual = weighted.difference - matmul(sums.coefficients, columns)
         total, known = jnp.sum(level.weight), weight > 0
         coverage = jnp.sum(jnp.where(linear.known, level.weight, 0.0)) / jnp.where(total > 0, total, 1.0)
@@ -231,19 +231,19 @@ class _Noise(eqx.Module):
     of_score: Float[Array, "d d"]
 
     @staticmethod
-    def of(evidence: Evidence, level: Level, warp: Warp, match: _Match) -> "_Noise":
-        passed = passage(level, warp, evidence.method.interpolation, match.weight)
-        template_part = (match.gain * evidence.method.template_noise) ** 2
-        if evidence.sigma is None:
+    def of(data: AlignmentData, level: Level, warp: Warp, match: _Match) -> "_Noise":
+        transfer = noise_transfer(level, warp, data.method.interpolation, match.weight)
+        template_part = (match.gain * data.method.template_noise) ** 2
+        if data.sigma is None:
             total, count = jnp.sum(match.weight), jnp.sum(match.known).astype(match.weight.dtype)
             spare = jnp.maximum(count - (warp.dof + level.columns.shape[0]), 1.0) / jnp.maximum(count, 1.0)
             mean = jnp.maximum(match.squares, 0.0) / jnp.where(total > 0, total * spare, 1.0)
-            variance = mean / (passed.residual + template_part)
+            variance = mean / (transfer.residual + template_part)
         else:
-            variance = evidence.sigma**2
-        # Two images without any difference leave the noise of rounding.
-        variance = jnp.maximum(variance, (level.spread * jnp.finfo(match.weight.dtype).eps) ** 2 + 1e-12)
-        score_part = variance * (passed.solution + template_part)
+            variance = data.sigma**2
+        # The variance of equal images is that of rounding.
+        variance = jnp.maximum(variance, (level.contrast * jnp.finfo(match.weight.dtype).eps) ** 2 + 1e-12)
+        score_part = variance * (transfer.solution + template_part)
         return _Noise(variance * (1.0 + template_part), score_part * matmul(match.steepest, match.steepest.T))
 
 
@@ -257,7 +257,7 @@ def _correlation(first: Float[Array, " n"], second: Float[Array, " n"], weight: 
 
 
 def _upright(level: Level, warp: Warp) -> Bool[Array, ""]:
-    """Whether the template's corners keep their order: it is neither folded nor seen from behind."""
+    """Whether the template's corners keep their order: the template is neither folded nor mirrored."""
     u = jnp.stack([level.u[0], level.u[-1], level.u[-1], level.u[0]])
     v = jnp.stack([level.v[0], level.v[0], level.v[-1], level.v[-1]])
     right, down = warp.map_components(u, v)
@@ -267,7 +267,7 @@ def _upright(level: Level, warp: Warp) -> Bool[Array, ""]:
 
 
 def _rounding(level: Level) -> float:
-    """Pixels that the dtype can tell apart on this template."""
+    """Resolution of positions in the dtype, px."""
     return float(jnp.finfo(level.template.dtype).eps) * 4.0 * max(level.frame.radius, *level.image.shape)
 
 

@@ -1,4 +1,4 @@
-"""The four ways to linearize ``sum (image(W(x)) - template(x))^2``: which image is differentiated, how W is updated.
+"""Four formulations of Lucas-Kanade: forwards or inverse, additive or compositional.
 
 References:
     Baker and Matthews, "Lucas-Kanade 20 years on: a unifying framework", IJCV 56(3), 2004, section 3 [K-27, K-72].
@@ -19,11 +19,11 @@ from jaxloc.images.warps import Euclidean, Homography, Warp, tangent_matrix
 
 
 class Linearized(eqx.Module):
-    """The image under a warp, and how one of both images changes when the warp moves.
+    """The warped image, and the derivatives of one of both images by the warp.
 
     Attributes:
         values: the image at the template's pixels.
-        known: where there is one.
+        known: where the image is known.
         slope: derivatives of the differentiated image, "2 n".
         right: derivative of the column by the warp's tangent, "d n".
         down: derivative of the row.
@@ -37,12 +37,12 @@ class Linearized(eqx.Module):
 
     @property
     def steepest(self) -> Float[Array, "d n"]:
-        """Steepest descent images: change of the differentiated image by the tangent."""
+        """Steepest descent images: derivative of the differentiated image by the tangent."""
         return self.slope[0][None] * self.right + self.slope[1][None] * self.down
 
 
 class Formulation(eqx.Module):
-    """Which image is differentiated and how the warp moves."""
+    """Choice of the differentiated image and of the update of the warp."""
 
     inverse: eqx.AbstractClassVar[bool]
 
@@ -52,10 +52,10 @@ class Formulation(eqx.Module):
 
     @abstractmethod
     def update(self, warp: Warp, step: Float[Array, " d"]) -> Warp:
-        """The warp moved by a solved step."""
+        """The warp updated by a step."""
 
     @abstractmethod
-    def bend(self, level: Level, warp: Warp, linear: Linearized) -> Float[Array, "d d n"]:
+    def warp_curvature(self, level: Level, warp: Warp, linear: Linearized) -> Float[Array, "d d n"]:
         """Second derivative of the warp along the differentiated image's slope: ``sum_c slope_c d2W_c / dp dp``."""
 
     @abstractmethod
@@ -64,21 +64,21 @@ class Formulation(eqx.Module):
 
 
 class ForwardsAdditive(Formulation):
-    """Lucas and Kanade's own: the image is differentiated at ``W(x; p)``, and ``p + dp`` is next."""
+    """Lucas and Kanade: the image is differentiated at ``W(x; p)``, and parameters are added, ``p + dp``."""
 
     inverse: ClassVar[bool] = False
 
     def linearize(self, level: Level, warp: Warp, method: AbstractInterpolation) -> Linearized:
         """The image's derivatives under the warp."""
-        seen = level.look_with_slope(warp, method)
+        sampled = level.sample_with_slope(warp, method)
         right, down = warp.additive_jacobian_components(level.u, level.v)
-        return Linearized(seen.values, seen.known, seen.slope, right, down)
+        return Linearized(sampled.values, sampled.known, sampled.slope, right, down)
 
     def update(self, warp: Warp, step: Float[Array, " d"]) -> Warp:
         """Sum of parameters."""
         return warp.add(step)
 
-    def bend(self, level: Level, warp: Warp, linear: Linearized) -> Float[Array, "d d n"]:
+    def warp_curvature(self, level: Level, warp: Warp, linear: Linearized) -> Float[Array, "d d n"]:
         """By differentiating the Jacobian."""
 
         def jacobian(step: Float[Array, " d"]) -> tuple[Array, Array]:
@@ -90,31 +90,31 @@ class ForwardsAdditive(Formulation):
 
     def second(self, level: Level, warp: Warp, method: AbstractInterpolation) -> Float[Array, "3 n"]:
         """Those of the image."""
-        return _seen_second(level, warp, method)
+        return _image_second(level, warp, method)
 
 
 class ForwardsCompositional(Formulation):
-    """The image is differentiated after warping, and ``W @ exp(d)`` is next."""
+    """The warped image is differentiated, and the update is composed, ``W @ exp(d)``."""
 
     inverse: ClassVar[bool] = False
 
     def linearize(self, level: Level, warp: Warp, method: AbstractInterpolation) -> Linearized:
         """Derivatives of the warped image: those of the image, through the warp."""
-        seen = level.look_with_slope(warp, method)
-        slope = through(warp, level, seen.slope)
-        return Linearized(seen.values, seen.known, slope, *warp.jacobian_components(level.u, level.v))
+        sampled = level.sample_with_slope(warp, method)
+        slope = through(warp, level, sampled.slope)
+        return Linearized(sampled.values, sampled.known, slope, *warp.jacobian_components(level.u, level.v))
 
     def update(self, warp: Warp, step: Float[Array, " d"]) -> Warp:
         """Composition."""
         return warp.retract(step)
 
-    def bend(self, level: Level, warp: Warp, linear: Linearized) -> Float[Array, "d d n"]:
+    def warp_curvature(self, level: Level, warp: Warp, linear: Linearized) -> Float[Array, "d d n"]:
         """Of the exponential."""
-        return _flow_bend(type(warp), level, linear)
+        return _flow_curvature(type(warp), level, linear)
 
     def second(self, level: Level, warp: Warp, method: AbstractInterpolation) -> Float[Array, "3 n"]:
         """Those of the image, through the warp's derivative."""
-        uu, uv, vv = _seen_second(level, warp, method)
+        uu, uv, vv = _image_second(level, warp, method)
         (a, b), (d, e) = _derivative(warp, level)
         along, across = a * uu + d * uv, a * uv + d * vv
         mixed = b * along + e * across
@@ -122,7 +122,7 @@ class ForwardsCompositional(Formulation):
 
 
 class InverseAdditive(Formulation):
-    """Hager and Belhumeur's: the template is differentiated, and parameters are added.
+    """Hager and Belhumeur: the template is differentiated, and parameters are added.
 
     For shifts, rotations, similarities and affine warps: a homography's Jacobian has no constant factor.
 
@@ -133,7 +133,7 @@ class InverseAdditive(Formulation):
     inverse: ClassVar[bool] = True
 
     def linearize(self, level: Level, warp: Warp, method: AbstractInterpolation) -> Linearized:
-        """The template's derivatives; the factor that depends on the warp is left to the update."""
+        """The template's derivatives; the factor that depends on the warp is applied in the update."""
         if isinstance(warp, Homography):
             raise ValueError(
                 "InverseAdditive: the Jacobian of a Homography has no constant factor; use InverseCompositional()."
@@ -141,16 +141,16 @@ class InverseAdditive(Formulation):
         return _of_template(level, warp, method)
 
     def update(self, warp: Warp, step: Float[Array, " d"]) -> Warp:
-        """The solved step seen through the warp's linear part, added."""
+        """Sum of the parameters and the step mapped by the warp's linear part."""
         linear = warp.matrix().at[:2, 2].set(0.0)
         moved = matmul(linear, tangent_matrix(step))
         if isinstance(warp, Euclidean):
             return warp.add(jnp.concatenate([moved[:2, 2], step[2:]]))
         return type(warp).from_matrix(warp.matrix() + moved)
 
-    def bend(self, level: Level, warp: Warp, linear: Linearized) -> Float[Array, "d d n"]:
+    def warp_curvature(self, level: Level, warp: Warp, linear: Linearized) -> Float[Array, "d d n"]:
         """Of the exponential."""
-        return _flow_bend(type(warp), level, linear)
+        return _flow_curvature(type(warp), level, linear)
 
     def second(self, level: Level, warp: Warp, method: AbstractInterpolation) -> Float[Array, "3 n"]:
         """Those of the template."""
@@ -158,7 +158,7 @@ class InverseAdditive(Formulation):
 
 
 class InverseCompositional(Formulation):
-    """Baker and Matthews's: the template is differentiated, once, and the inverse of the step is composed."""
+    """Baker and Matthews: the template is differentiated once, and the inverse of the step is composed."""
 
     inverse: ClassVar[bool] = True
 
@@ -170,9 +170,9 @@ class InverseCompositional(Formulation):
         """Composition."""
         return warp.retract(step)
 
-    def bend(self, level: Level, warp: Warp, linear: Linearized) -> Float[Array, "d d n"]:
+    def warp_curvature(self, level: Level, warp: Warp, linear: Linearized) -> Float[Array, "d d n"]:
         """Of the exponential."""
-        return _flow_bend(type(warp), level, linear)
+        return _flow_curvature(type(warp), level, linear)
 
     def second(self, level: Level, warp: Warp, method: AbstractInterpolation) -> Float[Array, "3 n"]:
         """Those of the template."""
@@ -180,12 +180,12 @@ class InverseCompositional(Formulation):
 
 
 def _of_template(level: Level, warp: Warp, method: AbstractInterpolation) -> Linearized:
-    seen = level.look(warp, method)
-    return Linearized(seen.values, seen.known, level.slope, *warp.jacobian_components(level.u, level.v))
+    sampled = level.sample(warp, method)
+    return Linearized(sampled.values, sampled.known, level.slope, *warp.jacobian_components(level.u, level.v))
 
 
 def _derivative(warp: Warp, level: Level) -> list[list[Array]]:
-    """Derivative of the warped coordinates by those before, row by row."""
+    """Derivative of the warped coordinates by the original ones, row by row."""
     right, down = warp.map_components(level.u, level.v)
     (a, b, _), (d, e, _), (g, h, i) = warp.matrix()
     depth = g * level.u + h * level.v + i
@@ -197,12 +197,12 @@ def _derivative(warp: Warp, level: Level) -> list[list[Array]]:
 
 
 def through(warp: Warp, level: Level, slope: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
-    """Derivatives of an image by the coordinates after a warp, as those by the coordinates before."""
+    """Chain rule: derivatives of an image by warped coordinates as derivatives by the original ones."""
     (a, b), (d, e) = _derivative(warp, level)
     return jnp.stack([slope[0] * a + slope[1] * d, slope[0] * b + slope[1] * e])
 
 
-def _flow_bend(warp: type[Warp], level: Level, linear: Linearized) -> Float[Array, "d d n"]:
+def _flow_curvature(warp: type[Warp], level: Level, linear: Linearized) -> Float[Array, "d d n"]:
     """Second derivative of ``exp(d) x`` at zero along the slope: ``(dX_j X_i + dX_i X_j) / 2`` of its fields X."""
     one, zero = jnp.ones_like(level.u), jnp.zeros_like(level.u)
     total = 0.0
@@ -213,20 +213,20 @@ def _flow_bend(warp: type[Warp], level: Level, linear: Linearized) -> Float[Arra
     return 0.5 * (total + jnp.swapaxes(total, 0, 1))
 
 
-def second_derivatives(picture: Float[Array, "h w"], level: Level) -> Float[Array, "3 h w"]:
+def second_derivatives(image: Float[Array, "h w"], level: Level) -> Float[Array, "3 h w"]:
     """Second derivatives (uu, uv, vv) of an image at a level's scale, by normalized coordinates."""
     scale = level.frame.radius / level.factor
-    along, across = derivatives(picture) * scale
+    along, across = derivatives(image) * scale
     (uu, uv), (_, vv) = derivatives(along) * scale, derivatives(across) * scale
     return jnp.stack([uu, uv, vv])
 
 
 def _template_second(level: Level) -> Float[Array, "3 n"]:
-    second = second_derivatives(level.picture, level).reshape(3, -1)
+    second = second_derivatives(level.template_image, level).reshape(3, -1)
     return jnp.where((level.weight > 0)[None] & jnp.isfinite(second), second, 0.0)
 
 
-def _seen_second(level: Level, warp: Warp, method: AbstractInterpolation) -> Float[Array, "3 n"]:
+def _image_second(level: Level, warp: Warp, method: AbstractInterpolation) -> Float[Array, "3 n"]:
     stacked = jnp.moveaxis(second_derivatives(level.image, level), 0, -1)
     values, _ = sample_components(stacked, *level.pixels(warp), method=method)
     return jnp.where(jnp.isfinite(values), values, 0.0).T

@@ -1,7 +1,7 @@
-"""How much of an image's noise interpolation lets through: to the residual, and to the solution.
+"""Transfer of image noise through interpolation, to the residual and to the solution of an alignment.
 
-Interpolated noise is weaker than that of the pixels, and neighbors share it. A residual shows the weaker noise; smooth
-derivatives add up what neighbors share, so that the solution feels nearly all of it.
+Interpolated noise has a smaller variance than that of the pixels and is correlated between neighbors. The residual has
+the smaller variance; weighted sums along smooth derivatives include the correlation and have nearly the full variance.
 """
 
 import equinox as eqx
@@ -12,42 +12,44 @@ from jaxloc.alignment.lucas_kanade.pyramid_level import Level
 from jaxloc.images.interpolation import AbstractInterpolation
 from jaxloc.images.warps import Warp
 
-_SAMPLES, _REACH = 48, 2  # pixels a side that are looked at, and neighbors that may share noise
+_SAMPLES, _REACH = 48, 2  # sampled pixels a side, and reach of the correlation
 
 
-class Passage(eqx.Module):
-    """Parts of the image noise's variance.
+class NoiseTransfer(eqx.Module):
+    """Ratios of variances to that of the image's noise.
 
     Attributes:
-        residual: in the value of a pixel.
-        solution: in a weighted sum along the template's derivatives, over what independent values would give.
+        residual: of an interpolated pixel.
+        solution: of a weighted sum along the template's derivatives, relative to independent pixels.
     """
 
     residual: Float[Array, ""]
     solution: Float[Array, ""]
 
 
-def passage(level: Level, warp: Warp, method: AbstractInterpolation, weight: Float[Array, " n"]) -> Passage:
-    """Measures both on a grid of the template's pixels: ``sum_l c(x, l) J(x) J(x + l)`` with the shared weights c."""
+def noise_transfer(
+    level: Level, warp: Warp, method: AbstractInterpolation, weight: Float[Array, " n"]
+) -> NoiseTransfer:
+    """Both ratios on a grid of the template's pixels: ``sum_l c(x, l) J(x) J(x + l)`` with the correlations c."""
     rows, columns = level.shape
     reach = min(_REACH, (min(rows, columns) - 1) // 2)
     places = jnp.stack([place.reshape(rows, columns) for place in level.pixels(warp)])
     slopes = (level.slope * weight[None]).reshape(2, rows, columns)
     here = _Shifted.of(places, slopes, (0, 0), reach, method)
-    own = here.shared(here)
+    own = here.correlation(here)
     total = 0.0
     for down in range(-reach, reach + 1):
         for right in range(-reach, reach + 1):
             there = _Shifted.of(places, slopes, (down, right), reach, method)
-            total = total + jnp.sum(here.shared(there)[None] * here.slopes * there.slopes)
+            total = total + jnp.sum(here.correlation(there)[None] * here.slopes * there.slopes)
     energy = jnp.sum(here.slopes * here.slopes)
     textured = energy > 0
     part = jnp.where(textured, total / jnp.where(textured, energy, 1.0), 1.0)
-    return Passage(jnp.maximum(jnp.mean(own), 0.05), jnp.clip(part, 0.05, 25.0))
+    return NoiseTransfer(jnp.maximum(jnp.mean(own), 0.05), jnp.clip(part, 0.05, 25.0))
 
 
 class _Shifted(eqx.Module):
-    """Pixels of the grid moved by a lag: the image pixels they are made of, with their weights, and their slopes."""
+    """Pixels of the grid shifted by a lag: interpolated image pixels with their weights, and the template's slopes."""
 
     columns: Float[Array, "a b"]
     rows: Float[Array, "a b"]
@@ -70,16 +72,16 @@ class _Shifted(eqx.Module):
         near = slopes[:, down, right][:, ::step_v, ::step_u]
         return _Shifted(floor_u, floor_v, method.weights(u - floor_u), method.weights(v - floor_v), near)
 
-    def shared(self, other: "_Shifted") -> Float[Array, "a b"]:
-        """Sum over the image's pixels of both weights."""
+    def correlation(self, other: "_Shifted") -> Float[Array, "a b"]:
+        """Sum of products of both interpolation weights over the image's pixels."""
         along = _overlap(self.columns, self.weights_u, other.columns, other.weights_u)
         return along * _overlap(self.rows, self.weights_v, other.rows, other.weights_v)
 
 
 def _overlap(first: Array, weights: tuple[Array, ...], second: Array, others: tuple[Array, ...]) -> Float[Array, "a b"]:
-    apart = second - first
+    offset = second - first
     total = jnp.zeros_like(first)
     for k, weight in enumerate(weights):
         for m, other in enumerate(others):
-            total = total + jnp.where(apart == k - m, weight * other, 0.0)
+            total = total + jnp.where(offset == k - m, weight * other, 0.0)
     return total

@@ -1,4 +1,4 @@
-"""The iterations at one scale."""
+"""Iterations of Lucas-Kanade at one scale."""
 
 from typing import Any
 
@@ -15,8 +15,8 @@ from jaxloc.alignment.lucas_kanade.steps import Descent
 from jaxloc.images.warps import Warp
 
 
-class Descended(eqx.Module):
-    """Where the iterations ended.
+class SearchResult(eqx.Module):
+    """Result of the iterations.
 
     Attributes:
         warp: in normalized coordinates.
@@ -41,25 +41,31 @@ class _Search(eqx.Module):
 
 
 def descend(
-    level: Level, start: Warp, brightness: Float[Array, " k"], matching: Matching, descent: Descent, *, limits: "Limits"
-) -> Descended:
-    """Steps until they are shorter than the tolerance.
+    level: Level,
+    initial: Warp,
+    brightness: Float[Array, " k"],
+    matching: Matching,
+    descent: Descent,
+    *,
+    limits: "Limits",
+) -> SearchResult:
+    """Iterates until steps are shorter than the tolerance.
 
-    A step that would fold the template or that is not finite is not taken, which ends the search there.
+    The search ends at a step that would fold the template or is not finite, without taking it.
     """
     dtype = level.template.dtype
-    prepared = Prepared.of(level, start, matching)
+    prepared = Prepared.of(level, initial, matching)
 
     def compare(warp: Warp, brightness: Float[Array, " k"]) -> Equations:
         return equations(level, prepared, warp, brightness, matching, second=descent.newton)
 
     nothing = jax.tree.map(
         lambda leaf: jnp.full(leaf.shape, jnp.inf if leaf.ndim == 0 else 0.0, leaf.dtype),
-        jax.eval_shape(lambda: compare(start, brightness)),
+        jax.eval_shape(lambda: compare(initial, brightness)),
     )
     nothing = eqx.tree_at(lambda known: known.brightness, nothing, brightness)
-    initial = _Search(
-        start, start, nothing, jnp.ones((), dtype), jnp.full((), jnp.inf, dtype), jnp.zeros((), jnp.int32)
+    first = _Search(
+        initial, initial, nothing, jnp.ones((), dtype), jnp.full((), jnp.inf, dtype), jnp.zeros((), jnp.int32)
     )
 
     def unfinished(search: _Search) -> Bool[Array, ""]:
@@ -72,37 +78,37 @@ def descend(
         damping = descent.damp(search.damping, accepted)
         step = -descent.solve(known, damping)
         if matching.formulation.inverse:
-            # A step divided by a gain near zero would be thrown far away.
+            # A gain near zero would give a huge step.
             step = step / jnp.maximum(known.gain, 0.25)
         trial = matching.formulation.update(best, jnp.where(jnp.isfinite(step), step, 0.0))
-        moved = travelled(level, best, trial)
+        moved = displacement(level, best, trial)
         possible = jnp.isfinite(moved)
         trial = _choose(possible, trial, best)
         return _Search(trial, best, known, damping, jnp.where(possible, moved, 0.0), search.count + 1)
 
-    end = lax.while_loop(unfinished, advance, initial)
+    end = lax.while_loop(unfinished, advance, first)
     if not descent.guarded:
-        return Descended(end.trial, end.known.brightness, end.moved, end.count)
-    # The last step has not been judged yet.
+        return SearchResult(end.trial, end.known.brightness, end.moved, end.count)
+    # The last step has not been accepted or rejected yet.
     now = compare(end.trial, end.known.brightness)
     warp, known = _choose(descent.accepts(now, end.known), (end.trial, now), (end.best, end.known))
-    return Descended(warp, known.brightness, end.moved, end.count)
+    return SearchResult(warp, known.brightness, end.moved, end.count)
 
 
 class Limits(eqx.Module):
-    """When to stop at one scale.
+    """Stopping criteria at one scale.
 
     Attributes:
         max_steps: bound on the number of steps.
-        tolerance: length of a step that counts as none, px of the full size.
+        tolerance: step length at convergence, px of the full size.
     """
 
     max_steps: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
 
 
-def travelled(level: Level, before: Warp, after: Warp) -> Float[Array, ""]:
-    """Greatest way of a corner of the template between two warps, px of the full size; infinite if one is lost."""
+def displacement(level: Level, before: Warp, after: Warp) -> Float[Array, ""]:
+    """Greatest displacement of a template corner between two warps, px of the full size; infinite if not finite."""
     u = jnp.stack([level.u[0], level.u[-1], level.u[0], level.u[-1]])
     v = jnp.stack([level.v[0], level.v[0], level.v[-1], level.v[-1]])
     old, new = before.map_components(u, v), after.map_components(u, v)

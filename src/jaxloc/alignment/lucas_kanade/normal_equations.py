@@ -1,4 +1,4 @@
-"""The normal equations of one comparison of two images, brightness eliminated and outliers weighted down."""
+"""Normal equations of alignment, with brightness eliminated and robust weights."""
 
 from typing import Any
 
@@ -16,17 +16,17 @@ from jaxloc.images.warps import Warp
 from jaxloc.solvers.cholesky import factor
 from jaxloc.solvers.robust_kernels import Loss, Quadratic
 
-_SCALE_SAMPLES = 1024  # pixels that tell the residual's scale: sorting all of them would cost more than the step
+_SCALE_SAMPLES = 1024  # sampled residuals for their scale, since sorting all costs more than the step
 
 
 class Matching(eqx.Module):
-    """How images are compared: what `equations` needs beside them.
+    """Options of the comparison of two images.
 
     Attributes:
         formulation: which image is differentiated.
         interpolation: of the image.
         loss: kernel on residuals over their scale.
-        sigma: scale of residuals, gray levels; None measures it by the median of their sizes.
+        sigma: scale of residuals, gray levels; None estimates it by the median of their absolute values.
     """
 
     formulation: Formulation
@@ -36,14 +36,14 @@ class Matching(eqx.Module):
 
 
 class Equations(eqx.Module):
-    """What is known at a warp, in normalized coordinates.
+    """Normal equations at a warp, in normalized coordinates.
 
     Attributes:
         hessian: of half the weighted squared residual.
         gradient: its derivative.
         brightness: coefficients of the brightness columns.
         gain: contrast of the image over that of the template.
-        mean_cost: half the weighted mean squared residual, gray levels squared; infinite where nothing is seen.
+        mean_cost: half the weighted mean squared residual, gray levels squared; infinite where nothing is visible.
     """
 
     hessian: Float[Array, "d d"]
@@ -57,8 +57,8 @@ class Weighted(eqx.Module):
     """Residuals of a comparison with their weights.
 
     Attributes:
-        difference: image less template, where both are.
-        residual: what brightness leaves of it.
+        difference: image less template, where both are known.
+        residual: difference less the brightness model.
         weight: of each pixel.
     """
 
@@ -79,7 +79,7 @@ def weigh(level: Level, linear: Linearized, brightness: Float[Array, " k"], matc
 
 
 def weight_slope(level: Level, weighted: Weighted, matching: Matching) -> Float[Array, " n"]:
-    """Derivative of each weight by its residual, the scale held."""
+    """Derivative of each weight by its residual, at constant scale."""
     if isinstance(matching.loss, Quadratic):
         return jnp.zeros_like(weighted.residual)
     scale = _scale(weighted.residual, weighted.weight) if matching.sigma is None else matching.sigma
@@ -90,11 +90,11 @@ def weight_slope(level: Level, weighted: Weighted, matching: Matching) -> Float[
 
 
 class Prepared(eqx.Module):
-    """What an inverse formulation computes once.
+    """Precomputed parts of inverse formulations.
 
     Attributes:
         steepest: steepest descent images of the template.
-        hessian: of the whole template, brightness eliminated; None where robust weights change it in every step.
+        hessian: of the whole template, brightness eliminated; None with robust weights, which change in every step.
     """
 
     steepest: Float[Array, "d n"]
@@ -102,7 +102,7 @@ class Prepared(eqx.Module):
 
     @staticmethod
     def of(level: Level, warp: Warp, matching: Matching) -> "Prepared | None":
-        """Nothing for forward formulations."""
+        """The precomputed parts; None for forward formulations."""
         if not matching.formulation.inverse:
             return None
         right, down = warp.jacobian_components(level.u, level.v)
@@ -119,22 +119,22 @@ class Sums(eqx.Module):
     Attributes:
         by_columns: steepest images with columns.
         coefficients: of brightness in the difference.
-        gradient: steepest images with what brightness leaves of the difference.
-        squares: of what it leaves.
-        leaks: coefficients of brightness in the steepest images.
+        gradient: steepest images with the residual.
+        squares: of the residual.
+        steepest_brightness: coefficients of brightness in the steepest images.
     """
 
     by_columns: Float[Array, "d k"]
     coefficients: Float[Array, " k"]
     gradient: Float[Array, " d"]
     squares: Float[Array, ""]
-    leaks: Float[Array, "k d"]
+    steepest_brightness: Float[Array, "k d"]
 
     @staticmethod
     def of(
         steepest: Float[Array, "d n"], level: Level, difference: Float[Array, " n"], weight: Float[Array, " n"]
     ) -> "Sums":
-        """By one product with the steepest images and one among the others."""
+        """All sums, by one product with the steepest images and one among the others."""
         columns = level.columns
         k = columns.shape[0]
         others = jnp.concatenate([columns, difference[None]])
@@ -143,35 +143,41 @@ class Sums(eqx.Module):
         if k == 0:
             return Sums(outer[:, :0], inner[0, :0], outer[:, 0], inner[0, 0], outer[:, :0].T)
         if level.correlating:
-            return _correlating(outer, inner, level.spread)
+            return _correlating(outer, inner, level.contrast)
         solver = factor(inner[:k, :k])
         coefficients = solver.solve(inner[:k, k])
-        leaks = jnp.stack([solver.solve(row) for row in outer[:, :k]], axis=1)
+        steepest_brightness = jnp.stack([solver.solve(row) for row in outer[:, :k]], axis=1)
         gradient = outer[:, k] - matmul(outer[:, :k], coefficients)
-        return Sums(outer[:, :k], coefficients, gradient, inner[k, k] - jnp.sum(inner[:k, k] * coefficients), leaks)
+        return Sums(
+            outer[:, :k],
+            coefficients,
+            gradient,
+            inner[k, k] - jnp.sum(inner[:k, k] * coefficients),
+            steepest_brightness,
+        )
 
     def hessian(self, steepest: Float[Array, "d n"], weight: Float[Array, " n"]) -> Float[Array, "d d"]:
-        """Products of the steepest images less what brightness explains of them."""
-        return matmul(steepest * weight[None], steepest.T) - matmul(self.by_columns, self.leaks)
+        """Products of the steepest images with brightness projected out."""
+        return matmul(steepest * weight[None], steepest.T) - matmul(self.by_columns, self.steepest_brightness)
 
 
-def _correlating(outer: Float[Array, "d 3"], inner: Float[Array, "3 3"], spread: Float[Array, ""]) -> Sums:
+def _correlating(outer: Float[Array, "d 3"], inner: Float[Array, "3 3"], deviation: Float[Array, ""]) -> Sums:
     """Sums for the greatest correlation: the template counts times ``|i|^2 / t i``, not ``t i / |t|^2``."""
     total = jnp.where(inner[1, 1] > 0, inner[1, 1], 1.0)
     mean = inner[1] / total
     about = inner - inner[:, 1][:, None] * mean[None, :]
     # The image is the difference plus the template.
-    own = about[2, 2] + 2.0 * spread * about[0, 2] + spread**2 * about[0, 0]
-    both = about[0, 2] + spread * about[0, 0]
+    own = about[2, 2] + 2.0 * deviation * about[0, 2] + deviation**2 * about[0, 0]
+    both = about[0, 2] + deviation * about[0, 0]
     alike = both > 1e-6 * own
-    contrast = jnp.where(alike, own / jnp.where(alike, both, 1.0), spread)
-    by_template = contrast - spread
+    contrast = jnp.where(alike, own / jnp.where(alike, both, 1.0), deviation)
+    by_template = contrast - deviation
     coefficients = jnp.stack([by_template, mean[2] - by_template * mean[0]])
     gradient = outer[:, 2] - matmul(outer[:, :2], coefficients)
-    leaks = jnp.stack([jnp.zeros_like(outer[:, 1]), outer[:, 1] / total])
+    steepest_brightness = jnp.stack([jnp.zeros_like(outer[:, 1]), outer[:, 1] / total])
     energy = own * about[0, 0]
     unlike = 1.0 - jnp.where(alike, both * both / jnp.where(alike, energy, 1.0), 0.0)
-    return Sums(outer[:, :2], coefficients, gradient, unlike * total * spread**2, leaks)
+    return Sums(outer[:, :2], coefficients, gradient, unlike * total * deviation**2, steepest_brightness)
 
 
 def equations(
@@ -183,19 +189,19 @@ def equations(
     *,
     second: float = 0.0,
 ) -> Equations:
-    """The normal equations at a warp.
+    """Normal equations at a warp.
 
     Args:
         level: both images at one scale.
-        prepared: what does not change with the warp.
+        prepared: parts that do not depend on the warp.
         warp: in normalized coordinates.
-        brightness: coefficients by which outliers are told.
-        matching: how images are compared.
-        second: how much of the second derivatives' part enters the Hessian.
+        brightness: coefficients for the residuals of the robust weights.
+        matching: options of the comparison.
+        second: factor of the second-order part of the Hessian.
 
     Returns:
         Equations in which brightness is eliminated. The Hessian of an inverse formulation without robust weights is
-        that of the whole template, times the part of it that is seen.
+        that of the whole template, times the visible fraction.
     """
     linear = matching.formulation.linearize(level, warp, matching.interpolation)
     weighted = weigh(level, linear, brightness, matching)
@@ -211,8 +217,8 @@ def equations(
         residual = weighted.difference - matmul(sums.coefficients, level.columns)
         sign = -1.0 / jnp.maximum(gain, 0.25) if matching.formulation.inverse else jnp.ones_like(gain)
         hessian = hessian + second * sign * _second_order(level, warp, linear, residual * weighted.weight, matching)
-    seen = total > 0
-    mean_cost = jnp.where(seen, 0.5 * sums.squares / jnp.where(seen, total, 1.0), jnp.inf)
+    visible = total > 0
+    mean_cost = jnp.where(visible, 0.5 * sums.squares / jnp.where(visible, total, 1.0), jnp.inf)
     return Equations(hessian, sums.gradient, sums.coefficients, gain, mean_cost)
 
 
@@ -221,8 +227,8 @@ def gain_of(level: Level, coefficients: Float[Array, " k"]) -> Float[Array, ""]:
     one = jnp.ones((), level.template.dtype)
     if coefficients.shape[0] < 2:
         return one
-    textured = level.spread > 0
-    return one + jnp.where(textured, coefficients[0] / jnp.where(textured, level.spread, 1.0), 0.0)
+    textured = level.contrast > 0
+    return one + jnp.where(textured, coefficients[0] / jnp.where(textured, level.contrast, 1.0), 0.0)
 
 
 def _second_order(
@@ -232,9 +238,9 @@ def _second_order(
     uu, uv, vv = matching.formulation.second(level, warp, matching.interpolation)
     along = uu[None] * linear.right + uv[None] * linear.down
     across = uv[None] * linear.right + vv[None] * linear.down
-    picture = matmul(linear.right * residual[None], along.T) + matmul(linear.down * residual[None], across.T)
-    bend = matching.formulation.bend(level, warp, linear)
-    return picture + jnp.sum(bend * residual[None, None], axis=-1)
+    by_image = matmul(linear.right * residual[None], along.T) + matmul(linear.down * residual[None], across.T)
+    along_warp = matching.formulation.warp_curvature(level, warp, linear)
+    return by_image + jnp.sum(along_warp * residual[None, None], axis=-1)
 
 
 def _scale(residual: Float[Array, " n"], weight: Float[Array, " n"]) -> Float[Array, ""]:

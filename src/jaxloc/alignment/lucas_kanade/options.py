@@ -1,4 +1,4 @@
-"""All choices of an alignment in one record."""
+"""Options of Lucas-Kanade alignment."""
 
 import equinox as eqx
 
@@ -11,22 +11,22 @@ from jaxloc.solvers.robust_kernels import Loss, Quadratic
 
 
 class LucasKanade(eqx.Module):
-    """How two images are aligned.
+    """Options of an alignment.
 
     Attributes:
         formulation: `InverseCompositional`, `ForwardsCompositional`, `ForwardsAdditive` or `InverseAdditive`.
         descent: `GaussNewtonStep`, `LevenbergMarquardtStep`, `NewtonStep`, `DiagonalStep` or `SteepestDescentStep`.
         brightness: `GainBias`, `Bias` or `Unchanged`.
         scales: `Pyramid`, `Blurred` or `FullSize`.
-        loss: robust kernel on residuals in sigmas; the median of their sizes gives sigma where none is known.
+        loss: robust kernel on residuals in sigmas; an unknown sigma is estimated by the median of absolute residuals.
         interpolation: of the image.
         max_steps: bound on the number of steps at each scale.
-        tolerance: length of a step that counts as none, px; coarser scales are content with more.
+        tolerance: step length at convergence, px; larger at coarser scales.
         template_noise: standard deviation of the template's noise over that of the image's: 1 for two images of one
             camera, 0 for a clean map.
-        min_coverage: least part of the template that must lie on the image.
-        min_correlation: least correlation of a trusted result.
-        normalized: whether unknowns are counted in units of the template. Gauss-Newton does not care; in pixels counted
+        min_coverage: least fraction of the template within the image.
+        min_correlation: least correlation of a valid result.
+        normalized: whether unknowns are in units of the template's size. Gauss-Newton is invariant to it; in pixels
             from the corner, as in the paper, steepest descent and diagonal Hessians fail.
     """
 

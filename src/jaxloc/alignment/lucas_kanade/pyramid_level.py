@@ -1,4 +1,4 @@
-"""Both images at one scale, in coordinates that know no pixels: the template reaches from -1 to 1."""
+"""Image and template at one scale, in coordinates normalized to -1 to 1 over the template."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from jaxloc.images.warps import Homography, Similarity, Warp
 
 
 class Frame(eqx.Module):
-    """Template pixels x as ``y = (x - center) / radius``: unknowns of like size, and the same at every scale.
+    """Normalized coordinates ``y = (x - center) / radius`` of template pixels x, equal at every scale.
 
     Attributes:
         center: of the template, px of the full size.
@@ -28,7 +28,7 @@ class Frame(eqx.Module):
 
     @staticmethod
     def of(shape: tuple[int, int], normalized: bool = True) -> "Frame":
-        """The frame of a template of rows and columns; if it is not normalized, pixels counted from one."""
+        """The frame of a template of (rows, columns); pixels counted from one if not normalized."""
         rows, columns = shape
         if not normalized:
             return Frame((-1.0, -1.0), 1.0)
@@ -40,51 +40,51 @@ class Frame(eqx.Module):
         return Similarity(jnp.asarray(rows, dtype))
 
     def normalize(self, warp: Warp) -> Warp:
-        """A warp of pixels as one of normalized coordinates."""
+        """Converts a warp of pixels to normalized coordinates."""
         outer = self._to_pixels(warp.matrix().dtype)
         return type(warp).of(outer.inverse() @ warp @ outer)
 
     def denormalize(self, warp: Warp) -> Warp:
-        """A warp of normalized coordinates as one of pixels."""
+        """Converts a warp of normalized coordinates to pixels."""
         outer = self._to_pixels(warp.matrix().dtype)
         return type(warp).of(outer @ warp @ outer.inverse())
 
     def tangent_to_pixels(self, dof: int, dtype: Any) -> Float[Array, "d d"]:
-        """The matrix that takes a tangent of normalized coordinates to one of pixels."""
-        # The first directions of a homography are those of the smaller groups.
+        """Matrix that maps tangents of normalized coordinates to tangents of pixels."""
+        # The first tangent directions of a homography are those of the smaller groups.
         return Homography.of(self._to_pixels(dtype)).adjoint()[:dof, :dof]
 
 
 class Level(eqx.Module):
-    """One scale, with the template's pixels along the last axis.
+    """Image and template at one scale; template pixels along the last axis.
 
     Attributes:
-        image: the image, with nan where there is none.
+        image: the image, nan where unknown.
         channels: the image and its derivatives by u and v, where they are needed.
-        image: the template, with nan where there is none.
-        template: its values, n pixels, zero where there is none.
+        template_image: the template, nan where unknown.
+        template: its values, n pixels, zero where unknown.
         u: normalized column of each template pixel.
         v: normalized row.
-        weight: of each template pixel; zero where there is none.
+        weight: of each template pixel; zero where unknown.
         slope: derivative of the template by u and v, "2 n".
-        columns: what brightness adds, "k n".
-        spread: standard deviation of the template, gray levels, by which the first column is divided.
+        columns: of the brightness model, "k n".
+        contrast: standard deviation of the template, gray levels, by which the first column is divided.
         frame: of the template.
         factor: pixels of the full size to one of this scale.
         shape: rows and columns of the template at this scale.
-        correlating: whether brightness is that of the greatest correlation, or of the least squares.
+        correlating: whether brightness maximizes correlation, or minimizes squares.
     """
 
     image: Float[Array, "h w"]
     channels: Float[Array, "h w 3"] | None
-    picture: Float[Array, "p q"]
+    template_image: Float[Array, "p q"]
     template: Float[Array, " n"]
     u: Float[Array, " n"]
     v: Float[Array, " n"]
     weight: Float[Array, " n"]
     slope: Float[Array, "2 n"]
     columns: Float[Array, "k n"]
-    spread: Float[Array, ""]
+    contrast: Float[Array, ""]
     frame: Frame = eqx.field(static=True)
     factor: int = eqx.field(static=True)
     shape: tuple[int, int] = eqx.field(static=True)
@@ -99,7 +99,7 @@ class Level(eqx.Module):
         *,
         differentiate_image: bool = False,
     ) -> "Level":
-        """Prepares what does not change while the warp moves; weights are those of the full size."""
+        """Prepares the parts that do not depend on the warp; weights are those of the full size."""
         image, template, factor, dtype = scaled.image, scaled.template, scaled.factor, scaled.template.dtype
         weight = weight[::factor, ::factor]
         rows, columns = template.shape
@@ -112,7 +112,7 @@ class Level(eqx.Module):
         weight = jnp.where(known, weight, 0.0).reshape(-1)
         values = jnp.where(known, template, 0.0).reshape(-1)
         slope = compute_once(lambda slope: jnp.where(known[None], slope, 0.0).reshape(2, -1), slope)
-        standard, spread = _standardize(values, weight)
+        standard, contrast = _standardize(values, weight)
         channels = None
         if differentiate_image:
             by_pixel = derivatives(image) * (frame.radius / factor)
@@ -127,7 +127,7 @@ class Level(eqx.Module):
             weight,
             slope,
             brightness.columns(standard),
-            spread,
+            contrast,
             frame,
             factor,
             (rows, columns),
@@ -140,42 +140,42 @@ class Level(eqx.Module):
         radius, (right, down) = self.frame.radius, self.frame.center
         return (u * radius + right) / self.factor, (v * radius + down) / self.factor
 
-    def look(self, warp: Warp, method: AbstractInterpolation) -> "Seen":
-        """The image under the warp."""
+    def sample(self, warp: Warp, method: AbstractInterpolation) -> "SampledImage":
+        """The warped image."""
         values, inside = sample_components(self.image, *self.pixels(warp), method=method)
         known = inside & jnp.isfinite(values)
-        return Seen(jnp.where(known, values, 0.0), known)
+        return SampledImage(jnp.where(known, values, 0.0), known)
 
-    def look_around(self, warp: Warp, method: AbstractInterpolation) -> "SeenSlope":
-        """The image under the warp, and the derivatives of its interpolant by the image's pixels."""
+    def sample_with_interpolant_slope(self, warp: Warp, method: AbstractInterpolation) -> "SampledSlope":
+        """The warped image, and derivatives of its interpolant, per pixel of the image."""
         right, down = self.pixels(warp)
 
         def values(right: Float[Array, " n"], down: Float[Array, " n"]) -> Float[Array, " n"]:
             return sample_components(self.image, right, down, method=method)[0]
 
         one, zero = jnp.ones_like(right), jnp.zeros_like(right)
-        seen = self.look(warp, method)
+        sampled = self.sample(warp, method)
         slopes = [jax.jvp(values, (right, down), way)[1] for way in ((one, zero), (zero, one))]
         slope = jnp.stack(slopes) * (self.frame.radius / self.factor)
-        return SeenSlope(seen.values, seen.known, jnp.where(seen.known[None], slope, 0.0))
+        return SampledSlope(sampled.values, sampled.known, jnp.where(sampled.known[None], slope, 0.0))
 
-    def look_with_slope(self, warp: Warp, method: AbstractInterpolation) -> "SeenSlope":
-        """The image under the warp, and its derivatives by normalized coordinates, from differences of its pixels."""
+    def sample_with_slope(self, warp: Warp, method: AbstractInterpolation) -> "SampledSlope":
+        """The warped image, and its derivatives by normalized coordinates, from differences of pixels."""
         values, inside = sample_components(self.channels, *self.pixels(warp), method=method)
         known = inside & jnp.all(jnp.isfinite(values), axis=1)
         values = jnp.where(known[:, None], values, 0.0).T
-        return SeenSlope(values[0], known, values[1:])
+        return SampledSlope(values[0], known, values[1:])
 
 
-class Seen(eqx.Module):
-    """The image at the template's pixels, and where there is one."""
+class SampledImage(eqx.Module):
+    """The image at the template's pixels, and where it is known."""
 
     values: Float[Array, " n"]
     known: Bool[Array, " n"]
 
 
-class SeenSlope(eqx.Module):
-    """The image and its derivatives at the template's pixels, and where there are any."""
+class SampledSlope(eqx.Module):
+    """The image and its derivatives at the template's pixels, and where they are known."""
 
     values: Float[Array, " n"]
     known: Bool[Array, " n"]
@@ -183,15 +183,15 @@ class SeenSlope(eqx.Module):
 
 
 def derivatives(image: Float[Array, "h w"]) -> Float[Array, "2 h w"]:
-    """By columns and by rows: central differences, one-sided along the border; zero along an axis of one pixel."""
+    """Derivatives along rows and columns: central differences, one-sided at the border; zero along single pixels."""
     parts = [jnp.gradient(image, axis=axis) if image.shape[axis] > 1 else jnp.zeros_like(image) for axis in (1, 0)]
     return jnp.stack(parts)
 
 
 def _interior(scaled: Scaled) -> Bool[Array, "p q"]:
-    """Pixels that smoothing has not mixed with what lies beyond the border, and that have a central difference.
+    """Pixels unaffected by extrapolation beyond the border in smoothing, with central differences.
 
-    A one-sided difference shares its noise with the pixel itself: all along the border that makes templates shrink.
+    The noise of a one-sided difference is correlated with that of its pixel, which along the border biases the scale.
     """
     rows, columns = scaled.template.shape
     margin = min(max(scaled.margin, 1), (min(rows, columns) - 1) // 4)
@@ -208,5 +208,5 @@ def _standardize(values: Float[Array, " n"], weight: Float[Array, " n"]) -> tupl
     centered = jnp.where(weight > 0, values - mean, 0.0)
     variance = jnp.sum(weight * centered * centered) / total
     textured = variance > (8.0 * jnp.finfo(values.dtype).eps * jnp.abs(mean)) ** 2
-    spread = jnp.sqrt(jnp.where(textured, variance, 1.0))
-    return jnp.where(textured, centered / spread, 0.0), jnp.where(textured, spread, 0.0)
+    contrast = jnp.sqrt(jnp.where(textured, variance, 1.0))
+    return jnp.where(textured, centered / contrast, 0.0), jnp.where(textured, contrast, 0.0)

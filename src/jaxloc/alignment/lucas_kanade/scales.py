@@ -1,4 +1,4 @@
-"""From coarse to fine: at which scales two images are compared, one after the other."""
+"""Coarse-to-fine schedules: pyramids, blurred images, or the full size only."""
 
 from abc import abstractmethod
 
@@ -16,7 +16,7 @@ class Scaled(eqx.Module):
         image: the smoothed or smaller image.
         template: the smoothed or smaller template.
         factor: pixels of the full images to one of these.
-        margin: pixels along the border of the template that smoothing has mixed with what it made up beyond it.
+        margin: width of the template's border that smoothing mixes with extrapolated pixels, px.
     """
 
     image: Float[Array, "h w"]
@@ -34,7 +34,7 @@ class Scales(eqx.Module):
 
 
 class FullSize(Scales):
-    """Only the images themselves."""
+    """A single scale: the images themselves."""
 
     def of(self, image: Float[Array, "h w"], template: Float[Array, "p q"]) -> list[Scaled]:
         """The images."""
@@ -42,11 +42,11 @@ class FullSize(Scales):
 
 
 class Pyramid(Scales):
-    """Smaller images, each half the size of the next.
+    """Image pyramid; each level has half the size of the next.
 
     Attributes:
-        levels: their number, the full size included; fewer where an image would be left with less than `least` pixels.
-        least: pixels that the shorter side of the coarsest template has at least.
+        levels: number of levels, the full size included; fewer for small templates (see `least`).
+        least: least length of the shorter side of the coarsest template, px.
 
     References:
         Burt and Adelson, "The Laplacian pyramid as a compact image code", 1983.
@@ -66,10 +66,10 @@ class Pyramid(Scales):
 
 
 class Blurred(Scales):
-    """Full-sized images, smoothed less and less: for templates too small for a pyramid.
+    """Full-sized images with decreasing blur, for templates too small for a pyramid.
 
     Attributes:
-        sigmas: standard deviations of the Gaussians, px, falling; 0 is the image itself.
+        sigmas: standard deviations of the Gaussians, px, decreasing; 0 is the image itself.
     """
 
     sigmas: tuple[float, ...] = eqx.field(static=True, default=(4.0, 2.0, 0.0))

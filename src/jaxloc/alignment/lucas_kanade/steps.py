@@ -1,4 +1,4 @@
-"""Five ways from the normal equations to a step.
+"""Descent steps from the normal equations: Gauss-Newton, Newton, steepest descent, diagonal, Levenberg-Marquardt.
 
 References:
     Baker and Matthews, "Lucas-Kanade 20 years on: a unifying framework", IJCV 56(3), 2004, section 4 [K-27].
@@ -17,11 +17,11 @@ from jaxloc.solvers.cholesky import factor
 
 
 class Descent(eqx.Module):
-    """A way down.
+    """Rule for a descent step.
 
     Attributes:
-        newton: what it takes of the second derivatives' part of the Hessian: nothing, or all of it.
-        guarded: whether it takes steps back.
+        newton: factor of the second-order part of the Hessian that it uses.
+        guarded: whether steps may be rejected.
     """
 
     newton: eqx.AbstractVar[float]
@@ -29,10 +29,10 @@ class Descent(eqx.Module):
 
     @abstractmethod
     def solve(self, equations: Equations, damping: Float[Array, ""]) -> Float[Array, " d"]:
-        """The tangent that is to be taken off."""
+        """The step that is subtracted, in the tangent space."""
 
     def accepts(self, new: Equations, best: Equations) -> Bool[Array, ""]:
-        """Whether to go on from the new place; always, unless overridden."""
+        """Whether the new warp is accepted; always, unless overridden."""
         del new, best
         return jnp.array(True)
 
@@ -43,7 +43,7 @@ class Descent(eqx.Module):
 
 
 class GaussNewtonStep(Descent):
-    """The squared first derivatives stand for the Hessian."""
+    """Gauss-Newton approximation of the Hessian."""
 
     newton: ClassVar[float] = 0.0
 
@@ -53,17 +53,17 @@ class GaussNewtonStep(Descent):
 
 
 class NewtonStep(Descent):
-    """The whole Hessian, second derivatives of the image included: noisy, and indefinite not far from the answer.
+    """Newton step with second derivatives of the image; noisy, and indefinite not far from the solution.
 
     Attributes:
-        newton: 1 for the Hessian; -1 turns its second-order part round. Only so are the curves of the paper met: the
-            true Hessian does far worse on them.
+        newton: 1 for the Hessian; -1 reverses its second-order part, which reproduces the curves of the paper; the true
+            Hessian converges far worse there.
     """
 
     newton: float = eqx.field(static=True, default=1.0)
 
     def solve(self, equations: Equations, damping: Float[Array, ""]) -> Float[Array, " d"]:
-        """``H^-1 g``, also where H has negative eigenvalues."""
+        """``H^-1 g``, for indefinite H too."""
         matrix = equations.hessian
         scale = 1.0 / jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(matrix)), jnp.finfo(matrix.dtype).tiny))
         scaled = matrix * scale[:, None] * scale[None, :]
@@ -71,20 +71,20 @@ class NewtonStep(Descent):
 
 
 class SteepestDescentStep(Descent):
-    """Along the gradient, as far as the Gauss-Newton Hessian tells."""
+    """Along the gradient, with the step length of the Gauss-Newton Hessian."""
 
     newton: ClassVar[float] = 0.0
 
     def solve(self, equations: Equations, damping: Float[Array, ""]) -> Float[Array, " d"]:
         """``(g g / g H g) g``."""
         gradient = equations.gradient
-        bend = jnp.sum(gradient * matmul(equations.hessian, gradient))
-        curved = bend > 0
-        return jnp.where(curved, jnp.sum(gradient**2) / jnp.where(curved, bend, 1.0), 0.0) * gradient
+        curvature = jnp.sum(gradient * matmul(equations.hessian, gradient))
+        curved = curvature > 0
+        return jnp.where(curved, jnp.sum(gradient**2) / jnp.where(curved, curvature, 1.0), 0.0) * gradient
 
 
 class DiagonalStep(Descent):
-    """Each direction by itself.
+    """Diagonal approximation of the Hessian.
 
     Attributes:
         newton: 0 for the diagonal of the Gauss-Newton Hessian, otherwise as in `NewtonStep`.
@@ -100,10 +100,10 @@ class DiagonalStep(Descent):
 
 
 class LevenbergMarquardtStep(Descent):
-    """Gauss-Newton, damped more after each step that made things worse, and that step is taken back.
+    """Levenberg-Marquardt: steps that increase the cost are rejected and damped more.
 
     Attributes:
-        initial_damping: part of the diagonal that is added to it.
+        initial_damping: fraction of the diagonal that is added to it.
     """
 
     initial_damping: float = eqx.field(static=True, default=1e-3)
@@ -118,9 +118,9 @@ class LevenbergMarquardtStep(Descent):
         return factor(matrix + jnp.diag(added)).solve(equations.gradient)
 
     def accepts(self, new: Equations, best: Equations) -> Bool[Array, ""]:
-        """Only downhill."""
+        """Only steps that decrease the cost."""
         return new.mean_cost <= best.mean_cost
 
     def damp(self, damping: Float[Array, ""], accepted: Bool[Array, ""]) -> Float[Array, ""]:
-        """A tenth, or ten times."""
+        """A tenth after accepted steps, ten times after rejected ones."""
         return jnp.clip(jnp.where(accepted, 0.1 * damping, 10.0 * damping), 1e-7, 1e9)

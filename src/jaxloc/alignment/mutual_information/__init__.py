@@ -1,6 +1,6 @@
-"""Alignment by mutual information: images whose gray levels follow from each other by no simple law.
+"""Alignment by mutual information: for images without a simple relation of gray levels.
 
-It stays the same under any one-to-one map of gray levels, as inversion or gamma [K-22, R-35, R-36].
+It is invariant to any one-to-one map of gray levels, as inversion or gamma [K-22, R-35, R-36].
 """
 
 from jaxloc.alignment.mutual_information.align import MutualInformation, align

@@ -21,19 +21,19 @@ from jaxloc.solvers import Estimate, Status
 
 
 class MutualInformation(eqx.Module):
-    """How images are aligned by mutual information.
+    """Options of alignment by mutual information.
 
     Attributes:
-        bins: of each gray level; the fewer, the wider its splines, which pull the maximum aside where the image's
-            gray levels change along the way.
-        blurs: standard deviations by which both images are smoothed, from coarse to fine, px; a last blur of half a
-            pixel keeps interpolation from favoring whole pixels.
+        bins: number of bins of each image; fewer bins have wider splines, which bias the maximum where gray levels
+            vary.
+        blurs: standard deviations by which both images are smoothed, from coarse to fine, px; the last blur of half a
+            pixel avoids the bias of interpolation towards whole pixels.
         max_steps: bound on the number of steps at each scale.
-        tolerance: length of a step that counts as none, px.
-        min_coverage: least part of the template that must lie on the image.
-        min_information: least mutual information of a trusted result, nats.
-        least_sigma: error of a pixel's place that noise does not show, px: interpolation favors places between pixels,
-            and smoothing an image is not smoothing what another camera makes of it.
+        tolerance: step length at convergence, px.
+        min_coverage: least fraction of the template within the image.
+        min_information: least mutual information of a valid result, nats.
+        least_sigma: standard deviation of errors that noise does not explain, px: interpolation, and the difference
+            between smoothing an image and smoothing that of another camera.
     """
 
     bins: int = eqx.field(static=True, default=32)
@@ -54,27 +54,27 @@ def align(
     method: MutualInformation = MutualInformation(),
     mask: Num[Array, "p q"] | Bool[Array, "p q"] | None = None,
 ) -> Estimate:
-    """Finds the warp W under which ``image(W(x))`` tells most about ``template(x)``.
+    """Finds the warp W of the greatest mutual information of ``image(W(x))`` and ``template(x)``.
 
-    Maximizes mutual information from coarse to fine by damped Newton steps with analytic derivatives; negative
-    curvature is turned round. The value has the derivatives of the solution (implicit function theorem).
+    Maximizes from coarse to fine by damped Newton steps with analytic derivatives; negative eigenvalues of the
+    curvature are reversed. The value has the derivatives of the solution (implicit function theorem).
 
     Args:
-        image: gray levels, bytes or numbers; nan where there is no image.
-        template: gray levels; nan where it does not count.
-        warp: its class: `Translation`, `Euclidean`, `Similarity`, `Affine` or `Homography`.
-        initial: where to start, a warp of any class from template pixels to image pixels; the identity by default.
-        method: bins, scales, limits.
+        image: gray levels; nan where unknown.
+        template: gray levels; nan where unknown.
+        warp: class of the warp: `Translation`, `Euclidean`, `Similarity`, `Affine` or `Homography`.
+        initial: a warp of any class from template pixels to image pixels; the identity by default.
+        method: bins, scales and limits.
         mask: weights of the template's pixels.
 
     Returns:
         Estimate of the warp; `cost` is minus the mutual information, nats. With n pixels on the image, n times the
         mutual information is the gain in log-likelihood of the (estimated) joint density over independence, if pixels
         were independent; `information` is minus its Hessian. The covariance (of ``W @ exp(d)``) is the inverse, and
-        `least_sigma` in the mean over the template. It is cautious, not exact: blur and interpolation make pixels
-        dependent and pull the maximum aside by some hundredths of a pixel. `ok` is False if the texture leaves a
-        direction undetermined, the search did not settle, too little of the template lies on the image, or too little
-        is told.
+        `least_sigma` in the mean over the template. It is conservative, not exact: blur and interpolation make pixels
+        dependent and bias the maximum by some hundredths of a pixel. `ok` is False if the texture leaves a
+        direction undetermined, the search did not converge, too little of the template lies within the image, or the
+        mutual information is too small.
 
     Raises:
         ValueError: an image has not two axes, the mask has another shape, or there are too few bins.
@@ -88,17 +88,17 @@ def align(
         >>> u, v = jnp.meshgrid(jnp.arange(70.0), jnp.arange(60.0))
         >>> scene = lambda u, v: 120 + 50 * jnp.sin(0.3 * u) * jnp.cos(0.25 * v) + 0.8 * u
         >>> image, template = 255 - scene(u, v), scene(u + 10.3, v + 8.6)[:40, :48]
-        >>> start = jl.images.Translation(jnp.array([9.0, 10.0]))
-        >>> fit = jl.alignment.mutual_information.align(image, template, jl.images.Translation, start)
+        >>> initial = jl.images.Translation(jnp.array([9.0, 10.0]))
+        >>> fit = jl.alignment.mutual_information.align(image, template, jl.images.Translation, initial)
         >>> bool(fit.ok), [round(x, 1) for x in fit.value.translation.tolist()]
         (True, [10.3, 8.6])
     """
     template = as_gray(template)
     image = as_gray(image, template.dtype)
     weight = pixel_weights(template, mask, method.bins)
-    start = warp.identity(template.dtype) if initial is None else warp.of(initial)
-    start = jax.tree.map(lambda leaf: leaf.astype(template.dtype), start)
-    return _align(image, template, weight, start, method)
+    initial = warp.identity(template.dtype) if initial is None else warp.of(initial)
+    initial = jax.tree.map(lambda leaf: leaf.astype(template.dtype), initial)
+    return _align(image, template, weight, initial, method)
 
 
 class _Scale(eqx.Module):
@@ -128,7 +128,7 @@ class _Scale(eqx.Module):
 
 
 class _Ascent(eqx.Module):
-    """A point of the search, with the derivatives there."""
+    """State of the search: a warp with value and derivatives."""
 
     warp: Warp
     information: Float[Array, ""]
@@ -147,14 +147,14 @@ def _scales(image: Array, template: Array, weight: Array, method: MutualInformat
     u, v = ((x.reshape(-1) - c) / frame.radius for x, c in ((u, frame.center[0]), (v, frame.center[1])))
     scales = []
     for sigma in method.blurs:
-        pictures = image, template, (~finite).astype(image.dtype)
-        seen, sought, missing = (smooth(x, sigma) if sigma > 0 else x for x in pictures)
-        # Along the border, smoothing has mixed in what it made up beyond it.
+        channels = image, template, (~finite).astype(image.dtype)
+        smoothed, target, missing = (smooth(x, sigma) if sigma > 0 else x for x in channels)
+        # Along the border, smoothing used pixels extrapolated beyond it.
         margin = min(math.ceil(sigma), (min(template.shape) - 1) // 4)
         inner = jnp.pad(jnp.ones([side - 2 * margin for side in template.shape], weight.dtype), margin)
-        shares = Binning.of(sought, known, method.bins).spread(sought.reshape(-1))
-        binning = Binning.of(seen, jnp.ones(seen.shape, bool), method.bins)
-        channels = jnp.stack([seen, missing], axis=-1)
+        shares = Binning.of(target, known, method.bins).weights(target.reshape(-1))
+        binning = Binning.of(smoothed, jnp.ones(smoothed.shape, bool), method.bins)
+        channels = jnp.stack([smoothed, missing], axis=-1)
         scales.append(_Scale(channels, shares, u, v, (weight * inner).reshape(-1), binning, frame))
     return scales
 
@@ -179,10 +179,10 @@ def _evaluate(scale: _Scale, warp: Warp) -> tuple[Array, Array, Array, Array]:
     slope = along_u[None] * by_u + along_v[None] * by_v
     weight = scale.weights(known)
     weight = weight / jnp.maximum(jnp.sum(weight), 1e-6)
-    share, first, second = scale.binning.spread_with_derivatives(values)
+    share, first, second = scale.binning.weights_with_derivatives(values)
     density = matmul(scale.shares * weight[None], share.T)
-    told = log_ratio(density, conditional=True)
-    expected = matmul(told.T, scale.shares)
+    ratio = log_ratio(density, conditional=True)
+    expected = matmul(ratio.T, scale.shares)
     gradient = jnp.sum(slope * (weight * jnp.sum(expected * first, axis=0))[None], axis=1)
     change = jax.vmap(lambda row: matmul(scale.shares, (first * (row * weight)[None]).T))(slope)
     inverse = jnp.where(density > 1e-12, 1.0 / jnp.maximum(density, 1e-12), 0.0)
@@ -200,21 +200,21 @@ def _moved(scale: _Scale, warp: Warp, delta: Float[Array, " d"]) -> tuple[Array,
 
 
 def _information(scale: _Scale, warp: Warp, delta: Float[Array, " d"]) -> Float[Array, ""]:
-    """Mutual information of a warp that is moved by a tangent, by the definition."""
+    """Mutual information of a warp moved by a tangent vector, by definition."""
     values, known = scale.sample(*_moved(scale, warp, delta))
-    density = joint_density(scale.shares, scale.binning.spread(values), scale.weights(known))
+    density = joint_density(scale.shares, scale.binning.weights(values), scale.weights(known))
     return jnp.sum(density * log_ratio(density))
 
 
 def _climb(scale: _Scale, warp: Warp, method: MutualInformation) -> _Ascent:
-    """Damped Newton steps at one scale: a step that loses is not taken, the next is shorter."""
+    """Damped Newton steps at one scale: steps that decrease the information are rejected and shortened."""
     reach = 2.0 / scale.frame.radius
     tolerance = method.tolerance / scale.frame.radius
 
     zero, dof = jnp.zeros((), scale.u.dtype), warp.dof
     nothing = jnp.zeros(dof, zero.dtype), jnp.eye(dof, dtype=zero.dtype)
-    # The first step leads nowhere: it evaluates the start.
-    start = _Ascent(warp, zero - jnp.inf, *nothing, zero + 1e-2, zero + jnp.inf, jnp.zeros((), jnp.int32))
+    # The first step is zero: it evaluates the initial warp.
+    first = _Ascent(warp, zero - jnp.inf, *nothing, zero + 1e-2, zero + jnp.inf, jnp.zeros((), jnp.int32))
 
     def go_on(at: _Ascent) -> Bool[Array, ""]:
         return (at.count < method.max_steps) & (at.moved > tolerance) & (at.damping < 1e4)
@@ -237,13 +237,13 @@ def _climb(scale: _Scale, warp: Warp, method: MutualInformation) -> _Ascent:
         kept = tree.where(better, new, old)
         return eqx.tree_at(lambda a: a.count, kept, at.count + 1)
 
-    return lax.while_loop(go_on, advance, start)
+    return lax.while_loop(go_on, advance, first)
 
 
 @eqx.filter_jit
-def _align(image: Array, template: Array, weight: Array, start: Warp, method: MutualInformation) -> Estimate:
-    finite = jnp.all(jnp.isfinite(start.matrix()))
-    safe = tree.where(finite, start, type(start).identity(image.dtype))
+def _align(image: Array, template: Array, weight: Array, initial: Warp, method: MutualInformation) -> Estimate:
+    finite = jnp.all(jnp.isfinite(initial.matrix()))
+    safe = tree.where(finite, initial, type(initial).identity(image.dtype))
     frame = Frame.of(template.shape)
     warp = frame.normalize(lax.stop_gradient(safe))
     scales = _scales(image, template, weight, method)
@@ -260,7 +260,7 @@ def _align(image: Array, template: Array, weight: Array, start: Warp, method: Mu
 
 
 def _conclude(scale: _Scale, warp: Warp, moved: Array, count: Array, finite: Array, method: MutualInformation):
-    """Verdict, covariance, and one Newton step with the exact Hessian, which carries the derivatives."""
+    """Status, covariance, and one Newton step with the exact Hessian, which has the derivatives of the solution."""
     zero, frozen = jnp.zeros(warp.dof, scale.u.dtype), lax.stop_gradient(scale)
     curvature = -jax.hessian(lambda delta: _information(frozen, warp, delta))(zero)
     values = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(curvature), curvature, 0.0))
@@ -272,11 +272,11 @@ def _conclude(scale: _Scale, warp: Warp, moved: Array, count: Array, finite: Arr
     known = frozen.sample(*warp.map_components(scale.u, scale.v))[1]
     covered = jnp.sum(scale.weights(known))
     near = jnp.max(jnp.abs(step)) < 0.2 / scale.frame.radius
-    settled = near & (moved <= 10.0 * method.tolerance / scale.frame.radius)
+    converged = near & (moved <= 10.0 * method.tolerance / scale.frame.radius)
     admissible = (scale.coverage(known) >= method.min_coverage) & (-cost >= method.min_information)
     status = jnp.asarray(int(Status.CONVERGED), jnp.int32)
     for failed, code in (
-        (~settled, Status.MAX_STEPS),
+        (~converged, Status.MAX_STEPS),
         (~admissible, Status.INADMISSIBLE),
         (~regular, Status.RANK_DEFICIENT),
         (~finite, Status.NONFINITE),
@@ -286,15 +286,15 @@ def _conclude(scale: _Scale, warp: Warp, moved: Array, count: Array, finite: Arr
     value = scale.frame.denormalize(warp.retract(jnp.where(ok, step, 0.0)))
     to_pixels = scale.frame.tangent_to_pixels(warp.dof, zero.dtype)
     pixels = jnp.maximum(covered, 1.0)
-    spread = inverse / pixels + _hidden(frozen, warp, method)
-    covariance = matmul(to_pixels, matmul(jnp.where(regular, spread, eye), to_pixels.T))
+    scaled = inverse / pixels + _least_covariance(frozen, warp, method)
+    covariance = matmul(to_pixels, matmul(jnp.where(regular, scaled, eye), to_pixels.T))
     from_pixels = jnp.linalg.inv(to_pixels)
     information = matmul(from_pixels.T, matmul(jnp.where(regular, curvature * pixels, 0.0 * eye), from_pixels))
     return Estimate(value, lax.stop_gradient(covariance), cost, ok, count, status, lax.stop_gradient(information))
 
 
-def _hidden(scale: _Scale, warp: Warp, method: MutualInformation) -> Float[Array, "d d"]:
-    """Covariance of a warp that moves the template's pixels by `least_sigma` in the mean, by each way of it alike."""
+def _least_covariance(scale: _Scale, warp: Warp, method: MutualInformation) -> Float[Array, "d d"]:
+    """Covariance of a warp that moves the template's pixels by `least_sigma` in the mean, equally in all directions."""
     zero = jnp.zeros(warp.dof, scale.u.dtype)
     ways = jnp.concatenate(jax.jacfwd(lambda delta: _moved(scale, warp, delta))(zero)) * scale.frame.radius
     mean = matmul(ways.T, ways) / float(scale.u.shape[0])

@@ -1,4 +1,4 @@
-"""How much the gray levels of one image tell about those of another.
+"""Mutual information of two images, and their joint density.
 
 The joint density of both is a histogram smoothed with cubic B-splines (Parzen windows), so that mutual information has
 derivatives.
@@ -25,13 +25,13 @@ def mutual_information(
     bins: int = 32,
     mask: Num[Array, "h w"] | Bool[Array, "h w"] | None = None,
 ) -> Float[Array, ""]:
-    """How much the gray levels of one image tell about those of another: ``sum p(a, b) log(p(a, b) / (p(a) p(b)))``.
+    """Mutual information of the gray levels of two images, ``sum p(a, b) log(p(a, b) / (p(a) p(b)))``.
 
-    The joint density is a histogram in which each pixel pair is spread over 4x4 bins by cubic B-splines. The range of
+    The joint density is a histogram in which each pixel pair has weights in 4x4 bins by cubic B-splines. The range of
     gray levels, least to greatest, is taken from the images and has no derivative.
 
     Args:
-        a: gray levels; pixels that are not finite in either image do not count.
+        a: gray levels; pixels that are not finite in either image are ignored.
         b: gray levels.
         bins: static number of bins of each image, at least 5.
         mask: weights of pixels.
@@ -62,12 +62,12 @@ def mutual_information(
     known = weight > 0
     of_a, of_b = (Binning.of(jnp.where(known, x, 0.0), known, bins) for x in (a, b))
     values = [jnp.where(known, x, 0.0).reshape(-1) for x in (a, b)]
-    density = joint_density(of_a.spread(values[0]), of_b.spread(values[1]), weight.reshape(-1))
+    density = joint_density(of_a.weights(values[0]), of_b.weights(values[1]), weight.reshape(-1))
     return jnp.sum(density * log_ratio(density))
 
 
 def pixel_weights(template: Array, mask: Any, bins: int) -> Float[Array, "p q"]:
-    """Weights of an image's pixels, zero where not finite; refuses a mask of another shape, and too few bins."""
+    """Weights of an image's pixels, zero where not finite; raises for a mask of another shape and too few bins."""
     if bins < _LEAST_BINS:
         raise ValueError(f"Mutual information with {bins} bins: cubic B-splines need at least {_LEAST_BINS}.")
     if mask is not None and mask.shape != template.shape:
@@ -77,7 +77,7 @@ def pixel_weights(template: Array, mask: Any, bins: int) -> Float[Array, "p q"]:
 
 
 class Binning(eqx.Module):
-    """Gray levels to positions on the bins, ``1 ... bins - 2``, and the shares of the bins."""
+    """Map from gray levels to positions on the bins, ``1 ... bins - 2``, and B-spline weights of the bins."""
 
     low: Float[Array, ""]
     per_level: Float[Array, ""]
@@ -88,7 +88,7 @@ class Binning(eqx.Module):
         """The bins between the least and the greatest known value."""
         values = lax.stop_gradient(values)
         high, low = jnp.max(jnp.where(known, values, -jnp.inf)), jnp.min(jnp.where(known, values, jnp.inf))
-        # What rounding leaves of a flat image is no texture.
+        # Rounding errors of a constant image are no texture.
         level = jnp.maximum(jnp.abs(high), jnp.abs(low))
         textured = high - low > 32.0 * float(jnp.finfo(values.dtype).eps) * level
         span = jnp.where(textured, high - low, 1.0)
@@ -99,12 +99,12 @@ class Binning(eqx.Module):
         position = jnp.clip(1.0 + self.per_level * (values - self.low), 1.0, self.bins - 2.0)
         return position[None, :] - jnp.arange(self.bins, dtype=values.dtype)[:, None]
 
-    def spread(self, values: Float[Array, " n"]) -> Float[Array, "b n"]:
-        """Shares of the bins."""
+    def weights(self, values: Float[Array, " n"]) -> Float[Array, "b n"]:
+        """Weights of the bins."""
         return _spline(self.distances(values))
 
-    def spread_with_derivatives(self, values: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        """Shares, and their first and second derivatives by the gray level."""
+    def weights_with_derivatives(self, values: Float[Array, " n"]) -> tuple[Array, Array, Array]:
+        """Weights of the bins, and their first and second derivatives by the gray level."""
         x = self.distances(values)
         sign, size = jnp.sign(x), jnp.abs(x)
         near, far = size < 1.0, size < 2.0
@@ -124,7 +124,7 @@ def _spline(x: Array) -> Array:
 def joint_density(
     of_a: Float[Array, "b n"], of_b: Float[Array, "b n"], weight: Float[Array, " n"]
 ) -> Float[Array, "b b"]:
-    """Smoothed histogram of both, from the shares of the bins of n pixels each."""
+    """Smoothed histogram of both, from the bin weights of n pixels each."""
     total = jnp.sum(weight)
     return matmul(of_a * weight[None], of_b.T) / jnp.where(total > 0, total, 1.0)
 

@@ -1,4 +1,4 @@
-"""Bundle adjustment: cameras and points together, from what the cameras saw of the points."""
+"""Bundle adjustment: joint estimation of camera poses and points from image observations."""
 
 from jaxloc.refinement.bundle.adjust import adjust
 from jaxloc.refinement.bundle.estimate import BundleEstimate

@@ -1,4 +1,4 @@
-"""What bundle adjustment returns: a bundle, whether to believe it, and how sure chosen parts of it are."""
+"""Result of bundle adjustment, with covariances of chosen poses and points."""
 
 from typing import Any
 
@@ -18,22 +18,22 @@ from jaxloc.solvers.cholesky import factor
 
 
 class BundleEstimate(eqx.Module):
-    """The answer of bundle adjustment.
+    """Result of bundle adjustment.
 
-    It is no `jaxloc.solvers.Estimate`, since the covariance of all unknowns would hold the square of three numbers a
-    point: gigabytes. Covariances of the poses and points that are asked for are made on demand, and `pose_estimate`
-    gives what filters and pose graphs accept. Under plain least squares they are inverses of the Gauss-Newton Hessian,
-    right if the sigmas are; under robust kernels the sandwich of M-estimation, which believes the scatter that it saw.
+    It is no `jaxloc.solvers.Estimate`, since the covariance of all unknowns would take gigabytes. Covariances of chosen
+    poses and points are computed on demand, and `pose_estimate` gives what filters and pose graphs accept. Under plain
+    least squares they are inverses of the Gauss-Newton Hessian, correct for correct sigmas; under robust kernels the
+    sandwich covariance of M-estimation, from the observed scatter.
 
     Attributes:
         value: poses and points.
         cost: the objective at the value, the sum of rho.
         ok: whether the value can be used. Gradients are zero where it is False.
-        num_steps: steps taken, those that were refused too.
+        num_steps: steps taken, rejected ones included.
         status: a `jaxloc.solvers.Status`.
-        point_ok: points that their rays determine; the others keep their start.
-        problem: what was minimized.
-        structure: its tables.
+        point_ok: points that their rays determine; the others keep their initial value.
+        problem: the minimized problem.
+        structure: its index tables.
     """
 
     value: Bundle
@@ -61,8 +61,8 @@ class BundleEstimate(eqx.Module):
             blocks = eliminated.system.inverse().reshape(size, 6, size, 6)[cameras][:, :, cameras]
         else:
             rows = 6 * cameras[:, None] + jnp.arange(6, dtype=cameras.dtype)[None, :]
-            still, none = jnp.zeros(6 * size, self.cost.dtype), jnp.zeros_like(self.value.points)
-            unit = lambda row: Tangent(still.at[row].set(1.0).reshape(size, 6), none)  # noqa: E731
+            zeros, none = jnp.zeros(6 * size, self.cost.dtype), jnp.zeros_like(self.value.points)
+            unit = lambda row: Tangent(zeros.at[row].set(1.0).reshape(size, 6), none)  # noqa: E731
             solved = jax.lax.map(lambda row: eliminated.solve(unit(row)), rows.reshape(-1))
             blocks = self._scatter(eliminated, solved).reshape(count, 6, count, 6)
         free = ~self.problem.gauge.fixed[cameras]
@@ -79,28 +79,28 @@ class BundleEstimate(eqx.Module):
             Covariances; zero along directions that are undetermined (see ``point_ok``).
         """
         eliminated = self._factored()
-        still = jnp.zeros((self.value.poses.batch_shape[0], 6), self.cost.dtype)
+        zeros = jnp.zeros((self.value.poses.batch_shape[0], 6), self.cost.dtype)
         none = jnp.zeros_like(self.value.points)
 
         def block(point: Int[Array, ""]) -> Float[Array, "3 3"]:
-            unit = lambda axis: Tangent(still, none.at[point, axis].set(1.0))  # noqa: E731
+            unit = lambda axis: Tangent(zeros, none.at[point, axis].set(1.0))  # noqa: E731
             solved = jax.lax.map(lambda axis: eliminated.solve(unit(axis)), jnp.arange(3))
             if isinstance(self.problem.loss, Quadratic):
                 return solved.points[:, point]
             return self._scatter(eliminated, solved)
 
-        # One after the other: a solution is as long as the whole bundle.
+        # One after the other, since each solution has the size of the whole bundle.
         return _finite(jax.lax.map(block, points))
 
     def _scatter(self, eliminated: Eliminated, solved: Tangent) -> Float[Array, "d d"]:
         """Covariance under a robust kernel between unknowns, given their columns of the inverse Hessian."""
         scores = score_products(self.problem, self.value, self.structure, eliminated)
-        spread = jax.lax.map(scores.product, solved)
-        sides = ((spread.cameras, solved.cameras), (spread.points, solved.points))
+        scattered = jax.lax.map(scores.product, solved)
+        sides = ((scattered.cameras, solved.cameras), (scattered.points, solved.points))
         return sum(matmul(a.reshape(a.shape[0], -1), b.reshape(b.shape[0], -1).T) for a, b in sides)
 
     def pose_gaussian(self, camera: Any) -> Gaussian:
-        """The pose of one camera as a density: what filters and pose graphs accept."""
+        """The pose of one camera as a Gaussian density."""
         return self.pose_estimate(camera).gaussian()
 
     def pose_estimate(self, camera: Any) -> Estimate:
@@ -122,7 +122,7 @@ class BundleEstimate(eqx.Module):
         return Estimate(pose, covariance, self.cost, self.ok, self.num_steps, self.status, information)
 
     def describe(self) -> str:
-        """One line for people: how it ended (host only)."""
+        """One line of text with the status (host only)."""
         lost = int(jnp.sum(~self.point_ok))
         status = Status(int(self.status)).name.lower().replace("_", " ")
         return f"{status} ({int(self.num_steps)} steps, cost {float(self.cost):.6g}, {lost} points undetermined)"

@@ -1,6 +1,6 @@
-"""A bundle of rays: cameras, points, what the cameras saw of them, and what holds the whole in place.
+"""Bundle adjustment problem: observations, unknowns, gauge, and costs with their derivatives.
 
-Observations lie along the last axis here, components along the first: that is how the inner loops run fast.
+Observations lie along the last axis, components along the first, for speed.
 """
 
 from typing import Any
@@ -16,19 +16,19 @@ from jaxloc.refinement.bundle.structure import Structure
 from jaxloc.sensors import Pinhole, StereoRig
 from jaxloc.solvers import Loss, Quadratic
 
-# Residual, in sigmas, of a point that the camera cannot see: dear, so that no step hides points behind a camera.
-_UNSEEN = 1e3
+# Residual of an invisible point, sigmas: large, so that no step moves points behind a camera.
+_HIDDEN = 1e3
 
 
 class Observations(eqx.Module):
-    """What cameras saw of points; a fixed number of slots, of which some may be empty.
+    """Observations of points by cameras; a fixed number of slots, of which some may be empty.
 
     Attributes:
-        camera: "m", number of the camera.
-        point: "m", number of the point.
+        camera: "m", index of the camera.
+        point: "m", index of the point.
         measured: "m k", px: (u, v) of a camera, (u_left, u_right, v) of a stereo rig.
         sigma: "m k", standard deviation of each coordinate, px.
-        valid: slots that count; the numbers of others, nan too, have no influence.
+        valid: slots that are used; others may hold any numbers, nan too.
 
     Example:
         >>> import jax.numpy as jnp
@@ -57,7 +57,7 @@ class Observations(eqx.Module):
 
 
 class Bundle(eqx.Module):
-    """The unknowns.
+    """The unknowns of bundle adjustment.
 
     Attributes:
         poses: stack of c poses ``T_world_camera`` (of the left cameras).
@@ -68,17 +68,17 @@ class Bundle(eqx.Module):
     points: Float[Array, "n 3"]
 
     def moved(self, cameras: Float[Array, "c 6"], points: Float[Array, "n 3"]) -> "Bundle":
-        """Poses moved along tangents (right perturbation), points by addition."""
+        """The bundle with poses retracted (right perturbation) and points added to."""
         return Bundle(jax.vmap(lambda pose, delta: pose.retract(delta))(self.poses, cameras), self.points + points)
 
 
 class Gauge(eqx.Module):
-    """What holds a bundle in place: sights say nothing about where the whole is, nor, from one camera, how large.
+    """Gauge of a bundle: fixed poses or pose priors, since images determine neither its pose nor, for mono, its scale.
 
     Attributes:
-        fixed: cameras that stay where they start.
-        anchors: poses that others are drawn to, or None.
-        information: how strongly, in the tangent of the anchors; zero where a camera is free.
+        fixed: cameras whose poses are constant.
+        anchors: means of pose priors, or None.
+        information: of the priors, in the tangent of the anchors; zero where a camera is free.
     """
 
     fixed: Bool[Array, " c"]
@@ -87,43 +87,43 @@ class Gauge(eqx.Module):
 
     @staticmethod
     def fix(num_cameras: int, *cameras: int) -> "Gauge":
-        """Fixed cameras: one for a stereo rig; two for a single camera, whose distance then sets the scale."""
+        """Fixed cameras: one for a stereo rig; two for a single camera, whose distance determines the scale."""
         return Gauge(jnp.zeros(num_cameras, bool).at[jnp.asarray(cameras, jnp.int32)].set(True))
 
     @staticmethod
     def prior(poses: SE3, covariance: Float[Array, "c 6 6"], valid: Bool[Array, " c"]) -> "Gauge":
-        """Poses known beforehand, each with a covariance, where ``valid``."""
+        """Pose priors with covariances, where ``valid``."""
         eye = jnp.eye(6, dtype=covariance.dtype)
         safe = jnp.where(valid[:, None, None], covariance, eye[None])
         information = jnp.where(valid[:, None, None], jnp.linalg.inv(safe), 0.0)
         return Gauge(jnp.zeros(valid.shape, bool), poses, information)
 
     def cost(self, poses: SE3) -> Float[Array, ""]:
-        """Half the squared distance from the anchors."""
+        """Half the squared Mahalanobis distance from the anchors."""
         if self.anchors is None or self.information is None:
             return jnp.zeros((), poses.translation.dtype)
         return jnp.sum(jax.vmap(_anchor_cost)(poses, self.anchors, self.information))
 
-    def slopes(self, poses: SE3) -> Float[Array, "c 6"]:
-        """Derivative of the cost along the tangents of the poses."""
+    def gradients(self, poses: SE3) -> Float[Array, "c 6"]:
+        """Gradient of the cost in the tangents of the poses."""
         if self.anchors is None or self.information is None:
             return jnp.zeros((*poses.batch_shape, 6), poses.translation.dtype)
-        return jax.vmap(_anchor_slope)(poses, self.anchors, self.information)
+        return jax.vmap(_anchor_gradient)(poses, self.anchors, self.information)
 
-    def curvatures(self, poses: SE3, exact: bool) -> Float[Array, "c 6 6"]:
-        """Second derivative of the cost: Gauss and Newton's, or exact."""
+    def hessians(self, poses: SE3, exact: bool) -> Float[Array, "c 6 6"]:
+        """Hessian of the cost: Gauss-Newton, or exact."""
         if self.anchors is None or self.information is None:
             return jnp.zeros((*poses.batch_shape, 6, 6), poses.translation.dtype)
 
-        def curvature(pose: SE3, anchor: SE3, information: Array) -> Array:
+        def hessian(pose: SE3, anchor: SE3, information: Array) -> Array:
             if exact:
-                slope = jax.jacfwd(lambda delta: _anchor_slope(pose.retract(delta), anchor, information))
+                slope = jax.jacfwd(lambda delta: _anchor_gradient(pose.retract(delta), anchor, information))
                 bent = slope(jnp.zeros(6, information.dtype))
                 return 0.5 * (bent + bent.T)
             jacobian = SE3.left_jacobian_inverse(-anchor.local(pose))
             return matmul(jacobian.T, matmul(information, jacobian))
 
-        return jax.vmap(curvature)(poses, self.anchors, self.information)
+        return jax.vmap(hessian)(poses, self.anchors, self.information)
 
 
 def _anchor_cost(pose: SE3, anchor: SE3, information: Float[Array, "6 6"]) -> Float[Array, ""]:
@@ -131,30 +131,30 @@ def _anchor_cost(pose: SE3, anchor: SE3, information: Float[Array, "6 6"]) -> Fl
     return 0.5 * jnp.sum(distance * matmul(information, distance))
 
 
-def _anchor_slope(pose: SE3, anchor: SE3, information: Float[Array, "6 6"]) -> Float[Array, "6"]:
+def _anchor_gradient(pose: SE3, anchor: SE3, information: Float[Array, "6 6"]) -> Float[Array, "6"]:
     distance = anchor.local(pose)
     return matmul(SE3.left_jacobian_inverse(-distance).T, matmul(information, distance))
 
 
-class Sights(eqx.Module):
-    """A bundle seen from its cameras: the cost of each observation as a function of the point in the camera's frame.
+class ObservationCosts(eqx.Module):
+    """Costs of the observations as functions of the points in the cameras' frames.
 
     Attributes:
-        cost: of all observations, and of those that are hidden.
-        seen: observations whose point the camera sees.
-        frame: points in the frames of the cameras; safe where unseen.
+        cost: sum over all observations, hidden ones included.
+        visible: observations whose point is in front of the camera.
+        frame: points in the frames of the cameras; finite where hidden.
         rotation: of the cameras.
-        slope: derivative of the cost in the frame of the camera; zero where unseen.
-        curvature: second derivative of the cost.
-        information: ``w J^T J``, what the observation knows with the weight that it has.
+        gradient: of the cost in the frame of the camera; zero where hidden.
+        hessian: of the cost.
+        information: ``w J^T J``, the weighted Gauss-Newton Hessian.
     """
 
     cost: Float[Array, ""]
-    seen: Bool[Array, " m"]
+    visible: Bool[Array, " m"]
     frame: Float[Array, "3 m"]
     rotation: Float[Array, "3 3 m"]
-    slope: Float[Array, "3 m"]
-    curvature: Float[Array, "3 3 m"]
+    gradient: Float[Array, "3 m"]
+    hessian: Float[Array, "3 3 m"]
     information: Float[Array, "3 3 m"]
 
 
@@ -162,13 +162,13 @@ class BundleProblem(eqx.Module):
     """``sum rho(|W (h(T_c^-1 X_p) - z)|^2)`` over observations, and the cost of the gauge.
 
     Attributes:
-        model: the camera or stereo rig that took every image.
+        model: the camera or stereo rig of all images.
         camera: of each observation.
         point: of each observation.
         measured: "k m", px; finite everywhere.
         inverse_sigma: "k m", 1/px; finite everywhere.
-        usable: observations that count.
-        gauge: what holds the bundle in place.
+        usable: observations that are used.
+        gauge: fixed poses or priors.
         loss: robust kernel over the components of an observation.
     """
 
@@ -182,93 +182,96 @@ class BundleProblem(eqx.Module):
     loss: Loss = Quadratic()
 
     @staticmethod
-    def of(model: Any, start: Bundle, observations: Observations, gauge: Gauge, loss: Loss) -> "BundleProblem":
-        """The problem, with observations masked that are bad numbers, or whose point has too few rays."""
+    def of(model: Any, initial: Bundle, observations: Observations, gauge: Gauge, loss: Loss) -> "BundleProblem":
+        """The problem, with observations masked that are not finite, or whose point has too few rays."""
         measured, sigma = observations.measured, observations.sigma
         camera, point = observations.camera, observations.point
         good = jnp.all(jnp.isfinite(measured) & jnp.isfinite(sigma) & (sigma > 0), axis=1) & observations.valid
-        cameras, points = start.poses.batch_shape[0], start.points.shape[0]
+        cameras, points = initial.poses.batch_shape[0], initial.points.shape[0]
         good = good & (camera >= 0) & (camera < cameras) & (point >= 0) & (point < points)
         camera, point = jnp.where(good, camera, 0), jnp.where(good, point, 0)
-        good = good & jnp.all(jnp.isfinite(start.points), axis=1)[point]
+        good = good & jnp.all(jnp.isfinite(initial.points), axis=1)[point]
         rays = jax.ops.segment_sum(good.astype(jnp.int32), point, points)
         good = good & (rays >= (1 if isinstance(model, StereoRig) else 2))[point]
         safe = jnp.where(good[:, None], measured, 0.0), 1.0 / jnp.where(good[:, None], sigma, 1.0)
         return BundleProblem(model, camera, point, safe[0].T, safe[1].T, good, gauge, loss)
 
     def project(self, frame: Float[Array, "3 m"]) -> Float[Array, "k m"]:
-        """What the camera shows of points in its frame."""
+        """Measurements predicted for points in the camera's frame."""
         shown = self.model.project_components(frame[0], frame[1], frame[2])
         return shown if isinstance(self.model, StereoRig) else jnp.stack(shown)
 
     def frames(self, state: Bundle) -> tuple[Float[Array, "3 m"], Float[Array, "3 3 m"], Bool[Array, " m"]]:
-        """Points in the frames of the cameras that see them, the cameras' rotations, and whether they do see them."""
+        """Points in the frames of their cameras, the cameras' rotations, and the visible mask."""
         rotation = jnp.moveaxis(state.poses.rotation.rotation_matrix, 0, -1)[:, :, self.camera]
         arm = state.points.T[:, self.point] - state.poses.translation.T[:, self.camera]
         moved = jnp.sum(rotation * arm[:, None, :], axis=0)
         camera = self.model.camera if isinstance(self.model, StereoRig) else self.model
-        seen = self.usable & camera.in_front_components(moved[0], moved[1], moved[2])
-        ahead = jnp.array([0.0, 0.0, 1.0], moved.dtype)[:, None]
-        return jnp.where(seen[None], moved, ahead), rotation, seen
+        visible = self.usable & camera.in_front_components(moved[0], moved[1], moved[2])
+        forward = jnp.array([0.0, 0.0, 1.0], moved.dtype)[:, None]
+        return jnp.where(visible[None], moved, forward), rotation, visible
 
     def item_cost(self, frame: Float[Array, "3 m"]) -> Float[Array, " m"]:
-        """Cost of each observation with its point at a place in the frame of its camera."""
+        """Cost of each observation for points in the frames of the cameras."""
         error = (self.project(frame) - self.measured) * self.inverse_sigma
         return self.loss.rho(jnp.sum(error**2, axis=0))
 
     def cost(self, state: Bundle) -> Float[Array, ""]:
-        """The exact objective; points behind a camera that sees them are dear."""
-        frame, _, seen = self.frames(state)
-        return self._total(self.item_cost(frame), seen) + self.gauge.cost(state.poses)
+        """The exact objective; points behind an observing camera have a large constant cost."""
+        frame, _, visible = self.frames(state)
+        return self._total(self.item_cost(frame), visible) + self.gauge.cost(state.poses)
 
-    def _total(self, items: Float[Array, " m"], seen: Bool[Array, " m"]) -> Float[Array, ""]:
-        hidden = self.loss.rho(jnp.full((1,), _UNSEEN**2, items.dtype))
-        return jnp.sum(jnp.where(seen, items, jnp.where(self.usable, hidden, 0.0)))
+    def _total(self, items: Float[Array, " m"], visible: Bool[Array, " m"]) -> Float[Array, ""]:
+        hidden = self.loss.rho(jnp.full((1,), _HIDDEN**2, items.dtype))
+        return jnp.sum(jnp.where(visible, items, jnp.where(self.usable, hidden, 0.0)))
 
-    def sights(self, state: Bundle, *, near: Any = True, exact: bool = False) -> Sights:
-        """Cost, slope and curvature of each observation.
+    def observation_costs(self, state: Bundle, *, near: Any = True, exact: bool = False) -> ObservationCosts:
+        """Cost, gradient and Hessian of each observation.
 
-        Curvatures are positive semidefinite: what falling weights of robust kernels take off counts ``near`` a minimum
-        alone, and is bounded so that a tenth is left. The exact ones need not be.
+        The Hessians are positive semidefinite unless exact: the negative part due to decreasing robust weights is used
+        only ``near`` a minimum, and bounded so that a tenth remains.
         """
-        frame, rotation, seen = self.frames(state)
+        frame, rotation, visible = self.frames(state)
         error = (self.project(frame) - self.measured) * self.inverse_sigma
         squared = jnp.sum(error**2, axis=0)
         jacobian = self.inverse_sigma[None] * _along_axes(self.project, frame)
-        weight, fall = jax.jvp(self.loss.weight, (squared,), (jnp.ones_like(squared),))
+        weight, decrease = jax.jvp(self.loss.weight, (squared,), (jnp.ones_like(squared),))
         score = jnp.sum(jacobian * error[None], axis=1)
         information = weight[None, None] * jnp.sum(jacobian[:, None] * jacobian[None], axis=2)
         if exact:
-            curvature = _along_axes(lambda c: jax.vjp(self.item_cost, c)[1](jnp.ones_like(squared))[0], frame)
+            hessian = _along_axes(lambda c: jax.vjp(self.item_cost, c)[1](jnp.ones_like(squared))[0], frame)
         else:
             positive = squared > 0
-            fall = jnp.where(
-                positive & near, jnp.maximum(2.0 * fall, -0.9 * weight / jnp.where(positive, squared, 1.0)), 0.0
+            decrease = jnp.where(
+                positive & near, jnp.maximum(2.0 * decrease, -0.9 * weight / jnp.where(positive, squared, 1.0)), 0.0
             )
-            curvature = information + (fall[None] * score)[:, None] * score[None]
-        slope = jnp.where(seen[None], weight[None] * score, 0.0)
-        curvature, information = (jnp.where(seen[None, None], part, 0.0) for part in (curvature, information))
-        return Sights(self._total(self.loss.rho(squared), seen), seen, frame, rotation, slope, curvature, information)
+            hessian = information + (decrease[None] * score)[:, None] * score[None]
+        gradient = jnp.where(visible[None], weight[None] * score, 0.0)
+        hessian, information = (jnp.where(visible[None, None], part, 0.0) for part in (hessian, information))
+        return ObservationCosts(
+            self._total(self.loss.rho(squared), visible), visible, frame, rotation, gradient, hessian, information
+        )
 
     def gradient(self, state: Bundle, structure: Structure) -> tuple[Float[Array, "c 6"], Float[Array, "n 3"]]:
         """Derivative of the exact objective along the tangents of the cameras and of the points."""
-        sights = self.sights(state)
-        on_points = jnp.sum(sights.rotation * sights.slope[None], axis=1)
-        cameras = jax.ops.segment_sum(pose_rows(sights.slope, sights.frame).T, self.camera, structure.by_camera.count)
+        costs = self.observation_costs(state)
+        on_points = jnp.sum(costs.rotation * costs.gradient[None], axis=1)
+        rows = pose_rows(costs.gradient, costs.frame).T
+        cameras = jax.ops.segment_sum(rows, self.camera, structure.by_camera.count)
         points = jax.ops.segment_sum(on_points.T, self.point, structure.by_point.count)
-        cameras = jnp.where(self.gauge.fixed[:, None], 0.0, cameras + self.gauge.slopes(state.poses))
+        cameras = jnp.where(self.gauge.fixed[:, None], 0.0, cameras + self.gauge.gradients(state.poses))
         return cameras, points
 
     def admissible(self, state: Bundle) -> Bool[Array, ""]:
-        """Whether every point is ahead of the cameras that see it; robust kernels take others for outliers."""
+        """Whether all points are in front of their cameras; robust kernels treat others as outliers."""
         return jnp.all(self.frames(state)[2] == self.usable) | ~jnp.array(isinstance(self.loss, Quadratic))
 
 
 def _along_axes(function: Any, frame: Float[Array, "3 m"]) -> Float[Array, "3 k m"]:
-    """Derivative of a function of points: direction first, then what the function gives."""
+    """Derivative of a function of points: direction first, then the components of the function."""
     axes = jnp.eye(3, dtype=frame.dtype)
-    push = lambda axis: jax.jvp(function, (frame,), (jnp.broadcast_to(axis[:, None], frame.shape),))[1]  # noqa: E731
-    return jnp.stack([push(axes[i]) for i in range(3)])
+    along = lambda axis: jax.jvp(function, (frame,), (jnp.broadcast_to(axis[:, None], frame.shape),))[1]  # noqa: E731
+    return jnp.stack([along(axes[i]) for i in range(3)])
 
 
 def pose_rows(slope: Float[Array, "3 *k m"], frame: Float[Array, "3 m"]) -> Float[Array, "6 *k m"]:

@@ -1,7 +1,7 @@
-"""Who sees what: tables of a bundle that are made once, on the host, from the numbers of cameras and points.
+"""Sparsity structure of a bundle: index tables that are made once, on the host.
 
-Sums over ragged sets (the images of a point, the points of an image, the images that share points) run over padded
-rows of fixed length, so that a compiled program serves every bundle of the same size.
+Sums over ragged sets (the images of a point, the points of an image, the images that share points) use padded
+rows of fixed length, so that bundles of the same size share a compiled program.
 """
 
 from typing import Any
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-# Rows of the tables: short for points, which have few images each.
+# Lengths of the rows; short for points, which have few images each.
 _ROW_POINT, _ROW_CAMERA, _ROW_PAIR = 4, 32, 16
 
 
@@ -31,7 +31,7 @@ class Groups(eqx.Module):
 
     @staticmethod
     def of(group: np.ndarray, count: int, row: int, size: int) -> "Groups":
-        """Groups of items 0, 1, ... that belong to ``group[item]``; ``size`` stands for no item."""
+        """Groups of items 0, 1, ... that belong to ``group[item]``; ``size`` marks empty entries."""
         members, owner = _rows(np.asarray(group), row)
         order = np.append(np.argsort(group, kind="stable"), size)
         return Groups(jnp.asarray(order[members], jnp.int32), jnp.asarray(owner, jnp.int32), count)
@@ -44,7 +44,7 @@ class Groups(eqx.Module):
 
 
 class Structure(eqx.Module):
-    """Which camera sees which point, and which pairs of sights meet in a point.
+    """Index tables of observations by camera and by point, and of pairs of observations of one point.
 
     Attributes:
         by_camera: observations of each camera.
@@ -66,11 +66,11 @@ class Structure(eqx.Module):
 
     @staticmethod
     def of(camera: Any, point: Any, *, num_cameras: int, num_points: int) -> "Structure":
-        """The tables of a bundle; their memory grows with the sum of the squared numbers of images of the points.
+        """The tables of a bundle; memory is proportional to the sum of the squared numbers of images of the points.
 
         Args:
-            camera: "m", number of the camera of each observation; concrete numbers, on the host.
-            point: "m", number of its point.
+            camera: "m", index of the camera of each observation; concrete numbers, on the host.
+            point: "m", index of its point.
             num_cameras: how many cameras there are.
             num_points: how many points there are.
 
@@ -106,22 +106,22 @@ class Structure(eqx.Module):
 
 
 def with_zero(rows: Float[Array, "m *f"]) -> Float[Array, "n *f"]:
-    """The rows and one of zeros, for places in tables that hold nothing."""
+    """The rows and one of zeros, for empty entries of tables."""
     return jnp.concatenate([rows, jnp.zeros((1, *rows.shape[1:]), rows.dtype)])
 
 
 def _check(name: str, index: np.ndarray, count: int, length: int) -> None:
     if index.ndim != 1 or len(index) != length or not len(index) or not np.issubdtype(index.dtype, np.integer):
         raise ValueError(
-            f"Numbers of the {name}s have shape {index.shape} and type {index.dtype}: needs integers, one for each "
+            f"Indices of the {name}s have shape {index.shape} and type {index.dtype}: needs integers, one for each "
             f"observation, at least one, and as many cameras as points ({length})."
         )
     if index.min() < 0 or index.max() >= count:
-        raise ValueError(f"Numbers of the {name}s run from {index.min()} to {index.max()}, but there are {count}.")
+        raise ValueError(f"Indices of the {name}s are from {index.min()} to {index.max()}, but there are only {count}.")
 
 
 def _rows(group: np.ndarray, row: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places in the sorted order of groups, cut into rows, and the group of each row."""
+    """Positions in the sorted order of groups, divided into rows, and the group of each row."""
     counts = np.bincount(group)
     lines = -(-counts // row)
     owner = np.repeat(np.arange(len(counts)), lines)

@@ -1,7 +1,14 @@
-"""Cameras from images of a flat board: Zhang's start, a joint minimum, and the covariance of every parameter."""
+"""Camera calibration from images of a planar board: Zhang's method, nonlinear refinement and covariances."""
 
 from jaxloc.refinement.calibration.camera import Calibrated, calibrate
-from jaxloc.refinement.calibration.model import Fisheye, Glass, Intrinsics, LensModel, NoLens, Parametrization
+from jaxloc.refinement.calibration.model import (
+    BrownConradyModel,
+    Fisheye,
+    Intrinsics,
+    LensModel,
+    NoLens,
+    Parametrization,
+)
 from jaxloc.refinement.calibration.problem import CameraProblem, Rig, StereoProblem, Unknowns
 from jaxloc.refinement.calibration.stereo import CalibratedStereo, Corners, calibrate_stereo
 from jaxloc.refinement.calibration.summary import Errors, Parameters, board_errors, camera_names, camera_parameters
@@ -13,7 +20,7 @@ __all__ = [
     "Corners",
     "Errors",
     "Fisheye",
-    "Glass",
+    "BrownConradyModel",
     "Intrinsics",
     "LensModel",
     "NoLens",

@@ -1,4 +1,4 @@
-"""One camera from images of a flat board."""
+"""Calibration of one camera from images of a planar board."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration.model import Intrinsics, Parametrization
 from jaxloc.refinement.calibration.problem import BoardProblem, CameraProblem, Unknowns
-from jaxloc.refinement.calibration.zhang import Views, closed_form, extent, safe_views
+from jaxloc.refinement.calibration.zhang import Views, closed_form, extent, finite_views
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Quadratic, Solver, solve
 from jaxloc.solvers.estimate import Status
@@ -22,7 +22,7 @@ _MAX_STEPS = 100
 
 
 class Calibrated(eqx.Module):
-    """A calibrated camera and where the boards were.
+    """A calibrated camera and the poses of the boards.
 
     Attributes:
         camera: the camera.
@@ -45,30 +45,29 @@ def calibrate(
     loss: Any = Quadratic(),
     solver: Solver = LevenbergMarquardt(),
 ) -> Estimate:
-    """Focal lengths, principal point and lens of a camera from images of a flat board.
+    """Focal lengths, principal point and lens of a camera from images of a planar board.
 
     Minimizes ``sum rho(|project(T_i X_j) - z_ij|^2 / sigma^2)`` over the camera and the poses ``T_i`` of the boards,
-    starting at Zhang's closed form. All unknowns are found together, so that the covariance of the camera knows that
-    the poses are uncertain too.
+    starting at Zhang's closed form. All unknowns are estimated jointly, so that the covariance of the camera accounts
+    for the uncertain poses.
 
-    Focal length and distance, principal point and tilt, and the coefficients of a lens are almost exchangeable: use
-    float64 (``jax.enable_x64``). In float32 the values are right to about a fifth of their standard deviations where
-    the data are good; a nearly singular problem is reported as not ok earlier than in float64.
+    Focal length and distance, principal point and tilt, and the coefficients of a lens are strongly correlated: use
+    float64 (``jax.enable_x64``). In float32 the values are accurate to about a fifth of their standard deviations for
+    well-conditioned data; a nearly singular problem is reported as not ok earlier than in float64.
 
     Args:
         board: corners in the frame of the board, m, with z = 0.
-        corners: where they appear in each image, px.
-        valid: corners that count; numbers of others have no influence, nor have numbers that are not finite. Images
-            with fewer than six corners do not count.
-        intrinsics: which parameters are looked for.
-        shape: (rows, columns) of the images, for the start, and for a principal point that stays.
-        sigma: standard deviation of a coordinate of a corner, px; None takes it from the residuals.
+        corners: their pixels in each image.
+        valid: corners that are used; non-finite ones never are, nor images with fewer than six corners.
+        intrinsics: parameters that are estimated.
+        shape: (rows, columns) of the images, for the initial value, and for a fixed principal point.
+        sigma: standard deviation of a coordinate of a corner, px; None estimates it from the residuals.
         loss: robust kernel over the two coordinates of a corner, in sigmas.
-        solver: how to minimize.
+        solver: of the minimization.
 
     Returns:
-        Estimate of a `Calibrated`, whose tangent is (fx, fy, cx, cy, skew, coefficients of the lens, poses). What stays
-        has covariance zero. Images that do not count have the identity for a pose. ``ok`` is False when boards are
+        Estimate of a `Calibrated`, whose tangent is (fx, fy, cx, cy, skew, coefficients of the lens, poses). Fixed
+        parameters have covariance zero, unused images the identity as pose. ``ok`` is False when boards are
         too few or all parallel, when a corner lies behind the camera, or when the solver did not converge. See
         `summarize` for names and standard deviations.
 
@@ -91,31 +90,31 @@ def calibrate(
         (True, 500, 510)
     """
     check_corners(board, corners)
-    model, problem, start = prepare(safe_views(board, corners, valid), intrinsics, shape, loss)
-    found = fit(problem, start, sigma, solver)
+    model, problem, initial = prepare(finite_views(board, corners, valid), intrinsics, shape, loss)
+    found = fit(problem, initial, sigma, solver)
     value = Calibrated(model.camera(found.value.shared), found.value.boards)
-    return carried(found, value, model.basis())
+    return transform_estimate(found, value, model.basis())
 
 
 def prepare(
     views: Views, intrinsics: Intrinsics, shape: tuple[int, int] | None, loss: Any
 ) -> tuple[Parametrization, CameraProblem, Unknowns]:
-    """The units of a camera's unknowns, its problem (of sigma 1 px), and where to start."""
+    """The parametrization of a camera, its problem (of sigma 1 px), and the initial unknowns."""
     center, scale = jax.lax.stop_gradient(extent(views, shape))
     model = Parametrization.of(intrinsics, center, scale)
-    guess = closed_form(views, center, scale)
-    start = Unknowns(model.start(guess.focal, guess.center), guess.boards)
+    first = closed_form(views, center, scale)
+    initial = Unknowns(model.initial(first.focal, first.center), first.boards)
     problem = CameraProblem(model, views.board, views.pixels, views.valid, jnp.ones_like(scale), loss)
-    return model, problem, start
+    return model, problem, initial
 
 
-def check_corners(board: Array, *pictures: Array) -> None:
+def check_corners(board: Array, *images: Array) -> None:
     """Checks that images show the corners of the board.
 
     Raises:
         ValueError: if the numbers of corners differ.
     """
-    for corners in pictures:
+    for corners in images:
         if corners.shape[1] != board.shape[0]:
             raise ValueError(
                 f"The board has {board.shape[0]} corners, the images {corners.shape[1]}: give every image all "
@@ -123,41 +122,41 @@ def check_corners(board: Array, *pictures: Array) -> None:
             )
 
 
-def fit(problem: BoardProblem, start: Unknowns, sigma: Any, solver: Solver) -> Estimate:
-    """Solves; where no sigma is given, finds it from the residuals, for the covariance and for robust kernels.
+def fit(problem: BoardProblem, initial: Unknowns, sigma: Any, solver: Solver) -> Estimate:
+    """Solves the problem; without a sigma it is estimated from the residuals, for covariance and robust kernels.
 
-    Under plain least squares it has no influence on the answer. For robust kernels it is taken, by the median, after
-    the plain fit, and the robust one starts there.
+    Under plain least squares it does not affect the value. For robust kernels it is the median-based one after
+    a plain fit, which is the initial value of the robust one.
     """
     views, dtype = Views(problem.board, problem.pixels, problem.valid), problem.sigma.dtype
-    start = jax.lax.stop_gradient(start)
+    initial = jax.lax.stop_gradient(initial)
     if sigma is not None:
         problem = eqx.tree_at(lambda p: p.sigma, problem, jnp.asarray(sigma, dtype))
-        return _checked(solve(problem, start, solver=solver, max_steps=_MAX_STEPS))
+        return _checked(solve(problem, initial, solver=solver, max_steps=_MAX_STEPS))
     plain = eqx.tree_at(lambda p: (p.sigma, p.loss), problem, (jnp.ones((), dtype), Quadratic()))
-    found = solve(plain, start, solver=solver, max_steps=_MAX_STEPS)
+    found = solve(plain, initial, solver=solver, max_steps=_MAX_STEPS)
     if is_quadratic(problem.loss):
-        return _checked(_scaled(found, _spread(views, found)))
-    robust = jax.lax.stop_gradient(_median_spread(plain, found.value))
+        return _checked(_scaled(found, _variance(views, found)))
+    robust = jax.lax.stop_gradient(_median_sigma(plain, found.value))
     problem = eqx.tree_at(lambda p: p.sigma, problem, robust)
     return _checked(solve(problem, found.value, solver=solver, max_steps=_MAX_STEPS))
 
 
-def _freedom(views: Views, found: Estimate) -> Float[Array, ""]:
-    """Coordinates more than there are unknowns."""
+def _num_dof(views: Views, found: Estimate) -> Float[Array, ""]:
+    """Number of coordinates less the number of unknowns."""
     idle = SE3.dof * jnp.sum(~views.used())
     unknowns = found.covariance.shape[0] - idle
     return jnp.maximum(2 * jnp.sum(views.valid) - unknowns, 1).astype(found.cost.dtype)
 
 
-def _spread(views: Views, found: Estimate) -> Float[Array, ""]:
-    """Variance of a coordinate, px^2, from the residuals in px; never so small that it is only rounding."""
+def _variance(views: Views, found: Estimate) -> Float[Array, ""]:
+    """Variance of a coordinate, px^2, from the residuals in px; bounded below by rounding."""
     eps = float(jnp.finfo(found.cost.dtype).eps)
-    return jnp.maximum(2.0 * found.cost / _freedom(views, found), (4.0 * eps * 1e3) ** 2)
+    return jnp.maximum(2.0 * found.cost / _num_dof(views, found), (4.0 * eps * 1e3) ** 2)
 
 
 def _scaled(found: Estimate, variance: Float[Array, ""]) -> Estimate:
-    """The estimate as if its residuals had been whitened with this variance."""
+    """The estimate for residuals whitened with this variance."""
     return Estimate(
         found.value,
         found.covariance * variance,
@@ -169,20 +168,20 @@ def _scaled(found: Estimate, variance: Float[Array, ""]) -> Estimate:
     )
 
 
-def _median_spread(problem: BoardProblem, state: Unknowns) -> Float[Array, ""]:
-    """Standard deviation of a coordinate, px, by the median of the errors: outliers do not move it."""
+def _median_sigma(problem: BoardProblem, state: Unknowns) -> Float[Array, ""]:
+    """Standard deviation of a coordinate, px, by the median of the errors, robust to outliers."""
     errors, _ = problem.residual(state)
     squared = jnp.sum(errors**2, axis=0)
     valid = problem.valid.reshape(-1)
     ranked = jnp.sort(jnp.where(valid, squared, jnp.inf))
     middle = ranked[jnp.maximum(jnp.sum(valid) // 2, 0).clip(0, valid.size - 1)]
-    # The median of a chi-square number of two degrees of freedom is 2 ln 2.
-    spread = jnp.sqrt(jnp.where(jnp.isfinite(middle), middle, 1.0) / (2.0 * jnp.log(2.0)))
-    return jnp.maximum(spread.astype(errors.dtype), 1e-3)
+    # The median of chi-square with two degrees of freedom is 2 ln 2.
+    sigma = jnp.sqrt(jnp.where(jnp.isfinite(middle), middle, 1.0) / (2.0 * jnp.log(2.0)))
+    return jnp.maximum(sigma.astype(errors.dtype), 1e-3)
 
 
 def _checked(found: Estimate) -> Estimate:
-    """Not ok where the data leave an unknown, in units of the image, wholly open."""
+    """Not ok where an unknown, in units of the image, is undetermined."""
     size = found.covariance.shape[0] - SE3.dof * found.value.boards.translation.shape[0]
     shared = jnp.diagonal(found.covariance)[:size]
     open_ = ~jnp.all(shared[:2] < 1.0)
@@ -190,18 +189,18 @@ def _checked(found: Estimate) -> Estimate:
     return eqx.tree_at(lambda e: (e.ok, e.status), found, (found.ok & ~open_, status))
 
 
-def carried(found: Estimate, value: Any, *bases: Array) -> Estimate:
-    """The estimate of a value whose first parameters are linear in the first unknowns, and whose others are the same.
+def transform_estimate(found: Estimate, value: Any, *bases: Array) -> Estimate:
+    """Linear transform of an estimate: the first parameters are linear in the first unknowns, the others equal.
 
     Args:
         found: of the unknowns.
         value: of the parameters.
-        bases: how parameters move with unknowns, block by block; their columns do not overlap.
+        bases: derivatives of parameters by unknowns, block by block.
     """
     rest = found.covariance.shape[0] - sum(basis.shape[1] for basis in bases)
     eye = jnp.eye(rest, dtype=found.cost.dtype)
     forward = block_diag(*bases, eye)
     back = block_diag(*(basis / jnp.sum(basis**2, axis=0)[None, :] for basis in bases), eye)
-    spread = matmul(forward, matmul(found.covariance, forward.T))
+    covariance = matmul(forward, matmul(found.covariance, forward.T))
     information = matmul(back, matmul(found.information, back.T))
-    return Estimate(value, spread, found.cost, found.ok, found.num_steps, found.status, information)
+    return Estimate(value, covariance, found.cost, found.ok, found.num_steps, found.status, information)

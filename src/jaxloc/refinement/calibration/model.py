@@ -1,4 +1,4 @@
-"""What is to be found of a camera: which of its parameters move, and in which units the solver sees them."""
+"""Camera models of calibration: free parameters of pinhole and lens, and their scaling for the solver."""
 
 from abc import abstractmethod
 from typing import Any
@@ -16,7 +16,7 @@ _PINHOLE = ("fx", "fy", "cx", "cy", "skew")
 
 
 class LensModel(eqx.Module):
-    """Which lens a camera has, and which of its coefficients move; the others are zero."""
+    """Lens model of a camera and its free coefficients; the others are zero."""
 
     @abstractmethod
     def names(self) -> tuple[str, ...]:
@@ -24,7 +24,7 @@ class LensModel(eqx.Module):
 
     @abstractmethod
     def free(self) -> tuple[str, ...]:
-        """Those that move."""
+        """Free coefficients."""
 
     @abstractmethod
     def make(self, coefficients: Float[Array, " c"]) -> Lens | None:
@@ -35,11 +35,11 @@ class NoLens(LensModel):
     """An ideal pinhole."""
 
     def names(self) -> tuple[str, ...]:
-        """None."""
+        """No coefficients."""
         return ()
 
     def free(self) -> tuple[str, ...]:
-        """None."""
+        """No coefficients."""
         return ()
 
     def make(self, coefficients: Float[Array, " c"]) -> Lens | None:
@@ -48,12 +48,12 @@ class NoLens(LensModel):
         return None
 
 
-class Glass(LensModel):
-    """The usual glass lens, `BrownConrady`.
+class BrownConradyModel(LensModel):
+    """Radial and tangential distortion, `BrownConrady`.
 
     Attributes:
-        radial: how many radial coefficients move: 0 to 3, or 6 for the rational model.
-        tangential: whether the two of decentering move.
+        radial: number of free radial coefficients: 0 to 3, or 6 for the rational model.
+        tangential: whether the two tangential coefficients are free.
     """
 
     radial: int = eqx.field(static=True, default=3)
@@ -61,14 +61,14 @@ class Glass(LensModel):
 
     def __check_init__(self) -> None:
         if self.radial not in (0, 1, 2, 3, 6):
-            raise ValueError(f"Glass got radial={self.radial}; it must be 0, 1, 2, 3, or 6 (rational).")
+            raise ValueError(f"BrownConradyModel got radial={self.radial}; it must be 0, 1, 2, 3, or 6 (rational).")
 
     def names(self) -> tuple[str, ...]:
         """Five, or eight of the rational model, in OpenCV's order."""
         return ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")[: 8 if self.radial == 6 else 5]
 
     def free(self) -> tuple[str, ...]:
-        """Those that move."""
+        """Free coefficients."""
         radial = tuple(f"k{i + 1}" for i in range(self.radial))
         return tuple(n for n in self.names() if n in radial or (self.tangential and n[0] == "p"))
 
@@ -78,10 +78,10 @@ class Glass(LensModel):
 
 
 class Fisheye(LensModel):
-    """A lens of very wide view, `KannalaBrandt`.
+    """Fisheye lens, `KannalaBrandt`.
 
     Attributes:
-        radial: how many of the four coefficients move.
+        radial: number of free coefficients, up to four.
     """
 
     radial: int = eqx.field(static=True, default=4)
@@ -104,20 +104,20 @@ class Fisheye(LensModel):
 
 
 class Intrinsics(eqx.Module):
-    """Which parameters of a camera are looked for.
+    """Free parameters of a camera.
 
     Attributes:
-        lens: `Glass`, `Fisheye` or `NoLens`.
+        lens: `BrownConradyModel`, `Fisheye` or `NoLens`.
         square_pixels: one focal length for rows and columns.
-        principal_point: whether it moves; otherwise it stays at the center of the images.
-        skew: whether it moves; otherwise it is zero.
+        principal_point: whether it is free; otherwise it is the center of the images.
+        skew: whether it is free; otherwise it is zero.
 
     Example:
-        >>> Intrinsics(Glass(radial=2, tangential=False), square_pixels=True).free()
+        >>> Intrinsics(BrownConradyModel(radial=2, tangential=False), square_pixels=True).free()
         ('f', 'cx', 'cy', 'k1', 'k2')
     """
 
-    lens: LensModel = Glass()
+    lens: LensModel = BrownConradyModel()
     square_pixels: bool = eqx.field(static=True, default=False)
     principal_point: bool = eqx.field(static=True, default=True)
     skew: bool = eqx.field(static=True, default=False)
@@ -127,25 +127,25 @@ class Intrinsics(eqx.Module):
         return (*_PINHOLE, *self.lens.names())
 
     def free_pinhole(self) -> tuple[str, ...]:
-        """Those outside the lens that move; ``f`` is both focal lengths."""
+        """Free pinhole parameters; ``f`` is both focal lengths."""
         focal = ("f",) if self.square_pixels else ("fx", "fy")
         center = ("cx", "cy") if self.principal_point else ()
         return (*focal, *center, *(("skew",) if self.skew else ()))
 
     def free(self) -> tuple[str, ...]:
-        """All that move."""
+        """All free parameters."""
         return (*self.free_pinhole(), *self.lens.free())
 
 
 class Parametrization(eqx.Module):
-    """The camera as a linear function of what moves, in units that make every unknown a number near one.
+    """The camera as a linear function of scaled unknowns of the order of one.
 
-    ``parameters = offset + basis @ unknowns``: pixels count in ``scale`` px, so that single precision can tell a step
-    of the focal length from one of a lens.
+    ``parameters = offset + basis @ unknowns``: lengths are in units of ``scale`` px, so that single precision resolves
+    steps of focal lengths and of lens coefficients.
 
     Attributes:
-        intrinsics: what moves.
-        offset: parameters where the unknowns are zero: the values of those that stay.
+        intrinsics: free parameters.
+        offset: parameters for zero unknowns: the values of the fixed ones.
         scale: px.
     """
 
@@ -160,7 +160,7 @@ class Parametrization(eqx.Module):
         return Parametrization(intrinsics, offset, scale)
 
     def basis(self) -> Float[Array, "p u"]:
-        """How parameters move with unknowns."""
+        """Derivative of the parameters by the unknowns."""
         names, free = self.intrinsics.names(), self.intrinsics.free()
         pattern = np.zeros((len(names), len(free)))
         for column, name in enumerate(free):
@@ -175,8 +175,8 @@ class Parametrization(eqx.Module):
         values = self.offset + matmul(self.basis(), unknowns)
         return Pinhole(*(values[i] for i in range(5)), self.intrinsics.lens.make(values[5:]))
 
-    def start(self, focal: Float[Array, "2"], center: Float[Array, "2"]) -> Float[Array, " u"]:
-        """Unknowns of a camera without lens; what does not move stays where it is."""
+    def initial(self, focal: Float[Array, "2"], center: Float[Array, "2"]) -> Float[Array, " u"]:
+        """Unknowns of a camera without lens distortion."""
         fx, fy = focal[0] / self.scale, focal[1] / self.scale
         moved = (center - self.offset[2:4]) / self.scale
         known: dict[str, Any] = {"f": jnp.sqrt(fx * fy), "fx": fx, "fy": fy, "cx": moved[0], "cy": moved[1]}

@@ -1,7 +1,7 @@
-"""The reprojection errors of boards: unknowns that all images share, and a pose for each.
+"""Least-squares problems of calibration: shared unknowns and a board pose for each image.
 
-The Jacobian has the shape of an arrow: an image knows the shared unknowns and its own pose. Derivatives are taken
-forward, image by image, in those few directions alone, and put in their places.
+The Jacobian has the shape of an arrow: an image depends on the shared unknowns and its own pose. Derivatives are taken
+forward, image by image, in those few directions alone.
 """
 
 from abc import abstractmethod
@@ -19,13 +19,13 @@ from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Linearization, Problem, Quadratic
 from jaxloc.solvers.problem import items, with_losses
 
-# Residual, in sigmas, of a corner behind the camera: dear, so that no step hides boards there.
-_UNSEEN = 1e4
+# Residual of a corner behind the camera, sigmas: large, so that no step moves boards there.
+_HIDDEN = 1e4
 _LEAST_TILT = 0.025  # boards whose normals all lie within this angle of one direction count as parallel, rad
 
 
 class Unknowns(eqx.Module):
-    """What is looked for.
+    """Unknowns of calibration.
 
     Attributes:
         shared: by all images.
@@ -37,7 +37,7 @@ class Unknowns(eqx.Module):
 
 
 class Rig(eqx.Module):
-    """What two cameras share over all images.
+    """Unknowns of two cameras, shared by all images.
 
     Attributes:
         left: unknowns of the left camera.
@@ -51,15 +51,15 @@ class Rig(eqx.Module):
 
 
 class BoardProblem(Problem):
-    """Boards with a pose each; subclasses say what one board looks like.
+    """Boards with a pose each; subclasses define the projection of a board.
 
-    The residual is a pair: pixel errors, and for images that do not count the way from the pose at rest, which keeps
+    The residual is a pair: pixel errors, and for unused images the distance from the identity pose, which keeps
     the normal equations regular.
 
     Attributes:
         board: "3 m", m.
         pixels: "n 2 k", px; k corners an image, of all cameras.
-        valid: those that count.
+        valid: those that are used.
         sigma: of a coordinate of a corner, px.
     """
 
@@ -70,23 +70,23 @@ class BoardProblem(Problem):
 
     @abstractmethod
     def predict(self, shared: Any, pose: SE3) -> tuple[Float[Array, "2 k"], Bool[Array, " k"]]:
-        """Pixels of the corners of one board, and which are ahead of the cameras."""
+        """Pixels of the corners of one board, and which are in front of the cameras."""
 
     @property
     @abstractmethod
     def num_pinhole(self) -> int:
-        """How many unknowns outside the lens the boards have to tell."""
+        """Number of pinhole unknowns."""
 
     @abstractmethod
-    def sensible(self, shared: Any) -> Bool[Array, ""]:
-        """Whether the shared unknowns make a camera."""
+    def is_valid(self, shared: Any) -> Bool[Array, ""]:
+        """Whether the shared unknowns are a valid camera."""
 
     def one(self, shared: Any, pose: SE3, pixels: Float[Array, "2 k"], valid: Bool[Array, " k"]) -> tuple[Array, Array]:
         """Residual of one board."""
-        shown, ahead = self.predict(shared, pose)
-        error = jnp.where((valid & ahead)[None, :], shown - pixels, 0.0) / self.sigma
-        dear = jnp.where(valid & ~ahead, _UNSEEN, 0.0).astype(error.dtype)
-        return error + dear[None, :], jnp.where(jnp.any(valid), 0.0, _way_from_rest(pose))
+        predicted, in_front = self.predict(shared, pose)
+        error = jnp.where((valid & in_front)[None, :], predicted - pixels, 0.0) / self.sigma
+        penalty = jnp.where(valid & ~in_front, _HIDDEN, 0.0).astype(error.dtype)
+        return error + penalty[None, :], jnp.where(jnp.any(valid), 0.0, _pose_residual(pose))
 
     def residual(self, state: Unknowns) -> tuple[Float[Array, "2 i"], Float[Array, "6 n"]]:
         """Whitened errors of all boards."""
@@ -132,18 +132,18 @@ class BoardProblem(Problem):
         return jnp.block([[corner, side.T], [side, own.reshape(count * SE3.dof, -1)]])
 
     def admissible(self, state: Unknowns) -> Bool[Array, ""]:
-        """Whether the cameras are sensible, every corner is ahead of them, and the boards can tell the unknowns.
+        """Whether the cameras are valid, all corners are in front of them, and there are enough boards.
 
-        A board tells two numbers of a camera [T-17]; parallel boards tell the same two.
+        A board gives two constraints on a camera [T-17]; parallel boards give the same two.
         """
-        _, ahead = jax.vmap(self.predict, (None, 0))(state.shared, state.boards)
-        views = jnp.where(tilted(state.boards, self.valid), jnp.sum(jnp.any(self.valid, axis=1)), 1)
+        _, in_front = jax.vmap(self.predict, (None, 0))(state.shared, state.boards)
+        views = jnp.where(has_tilts(state.boards, self.valid), jnp.sum(jnp.any(self.valid, axis=1)), 1)
         enough = 2 * views >= self.num_pinhole
-        return self.sensible(state.shared) & jnp.all(ahead | ~self.valid) & enough
+        return self.is_valid(state.shared) & jnp.all(in_front | ~self.valid) & enough
 
 
 class CameraProblem(BoardProblem):
-    """Boards before one camera; shared are its unknowns."""
+    """Calibration of one camera; shared are its unknowns."""
 
     parametrization: Parametrization
     board: Float[Array, "3 m"]
@@ -153,21 +153,21 @@ class CameraProblem(BoardProblem):
     loss: Any = Quadratic()
 
     def predict(self, shared: Any, pose: SE3) -> tuple[Float[Array, "2 m"], Bool[Array, " m"]]:
-        """Pixels of the corners of one board, and which are ahead of the camera."""
+        """Pixels of the corners of one board, and which are in front of the camera."""
         return project(self.parametrization.camera(shared), pose, self.board)
 
     @property
     def num_pinhole(self) -> int:
-        """How many unknowns outside the lens the boards have to tell."""
+        """Number of pinhole unknowns."""
         return len(self.parametrization.intrinsics.free_pinhole())
 
-    def sensible(self, shared: Any) -> Bool[Array, ""]:
+    def is_valid(self, shared: Any) -> Bool[Array, ""]:
         """Whether focal lengths are positive."""
         return _positive(self.parametrization.camera(shared))
 
 
 class StereoProblem(BoardProblem):
-    """Boards before two cameras; shared is a `Rig`. Corners of the right image follow those of the left one."""
+    """Calibration of a stereo pair; shared is a `Rig`. Corners of the right image follow those of the left one."""
 
     left: Parametrization
     right: Parametrization
@@ -178,33 +178,33 @@ class StereoProblem(BoardProblem):
     loss: Any = Quadratic()
 
     def predict(self, shared: Any, pose: SE3) -> tuple[Float[Array, "2 k"], Bool[Array, " k"]]:
-        """Pixels of the corners of one board, and which are ahead of the cameras."""
-        shown, ahead = project(self.left.camera(shared.left), pose, self.board)
+        """Pixels of the corners of one board, and which are in front of the cameras."""
+        in_left, in_front = project(self.left.camera(shared.left), pose, self.board)
         other = shared.T_left_right.inverse() @ pose
-        shown_right, ahead_right = project(self.right.camera(shared.right), other, self.board)
-        return jnp.concatenate([shown, shown_right], axis=1), jnp.concatenate([ahead, ahead_right])
+        in_right, in_front_of_right = project(self.right.camera(shared.right), other, self.board)
+        return jnp.concatenate([in_left, in_right], axis=1), jnp.concatenate([in_front, in_front_of_right])
 
     @property
     def num_pinhole(self) -> int:
-        """How many unknowns outside the lens the boards have to tell of one camera."""
+        """Number of pinhole unknowns of one camera."""
         return max(len(side.intrinsics.free_pinhole()) for side in (self.left, self.right))
 
-    def sensible(self, shared: Any) -> Bool[Array, ""]:
+    def is_valid(self, shared: Any) -> Bool[Array, ""]:
         """Whether focal lengths are positive."""
         return _positive(self.left.camera(shared.left)) & _positive(self.right.camera(shared.right))
 
 
 def project(camera: Pinhole, pose: SE3, board: Float[Array, "3 m"]) -> tuple[Float[Array, "2 m"], Bool[Array, " m"]]:
-    """Pixels of points of a board at ``T_camera_board``, and which are ahead of the camera."""
+    """Pixels of points of a board at ``T_camera_board``, and which are in front of the camera."""
     moved = matmul(pose.rotation.matrix(), board) + pose.translation[:, None]
-    ahead = moved[2] > 0.0
-    depth = jnp.where(ahead, moved[2], 1.0)
-    x, y = jnp.where(ahead, moved[0], 0.0), jnp.where(ahead, moved[1], 0.0)
-    return jnp.stack(camera.project_components(x, y, depth)), ahead
+    in_front = moved[2] > 0.0
+    depth = jnp.where(in_front, moved[2], 1.0)
+    x, y = jnp.where(in_front, moved[0], 0.0), jnp.where(in_front, moved[1], 0.0)
+    return jnp.stack(camera.project_components(x, y, depth)), in_front
 
 
-def tilted(boards: SE3, valid: Bool[Array, "n k"]) -> Bool[Array, ""]:
-    """Whether the normals of the boards differ."""
+def has_tilts(boards: SE3, valid: Bool[Array, "n k"]) -> Bool[Array, ""]:
+    """Whether the boards are not all parallel."""
     used = jnp.any(valid, axis=1)
     normals = jnp.where(used[:, None], boards.rotation.rotation_matrix[:, :, 2], 0.0)
     count = jnp.maximum(jnp.sum(used), 1).astype(normals.dtype)
@@ -212,8 +212,8 @@ def tilted(boards: SE3, valid: Bool[Array, "n k"]) -> Bool[Array, ""]:
     return largest < 1.0 - 0.5 * _LEAST_TILT**2
 
 
-def _way_from_rest(pose: SE3) -> Float[Array, "6"]:
-    """Zero at the identity with unit derivative, and smooth everywhere, which the logarithm is not."""
+def _pose_residual(pose: SE3) -> Float[Array, "6"]:
+    """Zero at the identity with unit derivative, and smooth everywhere, unlike the logarithm."""
     r = pose.rotation.rotation_matrix
     turn = 0.5 * jnp.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
     return jnp.concatenate([pose.translation, turn])
@@ -228,7 +228,7 @@ def _flat(errors: Float[Array, "n 2 k"]) -> Float[Array, "2 i"]:
 
 
 def _arrow(slopes: Float[Array, "n d c k"], shared: int) -> Float[Array, "w c i"]:
-    """Derivatives of each image in its place: shared directions first, then six for each pose."""
+    """Arrow-shaped Jacobian: shared directions first, then six for each pose."""
     count, _, components, size = slopes.shape
     common = jnp.moveaxis(slopes[:, :shared], 0, 2).reshape(shared, components, count * size)
     eye = jnp.eye(count, dtype=slopes.dtype)

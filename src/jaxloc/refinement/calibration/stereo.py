@@ -1,4 +1,4 @@
-"""Two cameras that are fixed to each other, from images of a flat board that both may see."""
+"""Calibration of a stereo pair from images of a planar board."""
 
 from typing import Any
 
@@ -9,10 +9,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3
-from jaxloc.refinement.calibration.camera import carried, check_corners, fit, prepare
+from jaxloc.refinement.calibration.camera import check_corners, fit, prepare, transform_estimate
 from jaxloc.refinement.calibration.model import Intrinsics
 from jaxloc.refinement.calibration.problem import CameraProblem, Rig, StereoProblem, Unknowns
-from jaxloc.refinement.calibration.zhang import safe_views
+from jaxloc.refinement.calibration.zhang import finite_views
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Quadratic, solve
 
@@ -22,7 +22,7 @@ class Corners(eqx.Module):
 
     Attributes:
         pixels: px.
-        valid: corners that count; None for all. Those that are not finite never do.
+        valid: corners that are used; None for all. Non-finite ones never are.
     """
 
     pixels: Float[Array, "boards corners 2"]
@@ -30,7 +30,7 @@ class Corners(eqx.Module):
 
 
 class CalibratedStereo(eqx.Module):
-    """Two calibrated cameras and where the boards were.
+    """Two calibrated cameras and the poses of the boards.
 
     Attributes:
         left: the left camera.
@@ -56,19 +56,19 @@ def calibrate_stereo(
     sigma: Any = None,
     loss: Any = Quadratic(),
 ) -> Estimate:
-    """Two cameras, and the pose of one in the frame of the other, from images of a flat board.
+    """Two cameras and their relative pose from images of a planar board.
 
     Minimizes the whitened reprojection errors of both cameras over both cameras, ``T_left_right`` and the poses
-    ``T_left_board`` together: see `calibrate`, and the precision that it asks for. A pair in which only one camera sees
-    the board still tells about that camera.
+    ``T_left_board`` together: see `calibrate`, and the precision that it needs. A pair in which only one camera sees
+    the board is used for that camera.
 
     Args:
         board: corners in the frame of the board, m, with z = 0.
-        left: where they appear in each image of the left camera.
-        right: where they appear in the image of the right camera at the same instant.
-        intrinsics: which parameters are looked for, of either camera.
-        shape: (rows, columns) of the images, for the start, and for a principal point that stays.
-        sigma: standard deviation of a coordinate of a corner, px; None takes it from the residuals.
+        left: their pixels in each image of the left camera.
+        right: their pixels in the simultaneous image of the right camera.
+        intrinsics: parameters that are estimated, of either camera.
+        shape: (rows, columns) of the images, for the initial value, and for a fixed principal point.
+        sigma: standard deviation of a coordinate of a corner, px; None estimates it from the residuals.
         loss: robust kernel over the two coordinates of a corner, in sigmas.
 
     Returns:
@@ -97,10 +97,10 @@ def calibrate_stereo(
         (True, 0.1)
     """
     check_corners(board, left.pixels, right.pixels)
-    sides = [prepare(safe_views(board, side.pixels, side.valid), intrinsics, shape, loss) for side in (left, right)]
+    sides = [prepare(finite_views(board, side.pixels, side.valid), intrinsics, shape, loss) for side in (left, right)]
     (left_model, left_problem, _), (right_model, right_problem, _) = sides
-    alone = [_alone(problem, start) for _, problem, start in sides]
-    start = _join(alone, [left_problem.valid, right_problem.valid])
+    single = [_solve_single(problem, initial) for _, problem, initial in sides]
+    initial = _join(single, [left_problem.valid, right_problem.valid])
     problem = StereoProblem(
         left_model,
         right_model,
@@ -110,24 +110,24 @@ def calibrate_stereo(
         left_problem.sigma,
         loss,
     )
-    found = fit(problem, start, sigma, LevenbergMarquardt())
+    found = fit(problem, initial, sigma, LevenbergMarquardt())
     rig = found.value.shared
     value = CalibratedStereo(
         left_model.camera(rig.left), right_model.camera(rig.right), rig.T_left_right, found.value.boards
     )
-    return carried(found, value, left_model.basis(), right_model.basis())
+    return transform_estimate(found, value, left_model.basis(), right_model.basis())
 
 
-def _alone(problem: CameraProblem, start: Unknowns) -> Unknowns:
-    """One camera by itself, as a start."""
+def _solve_single(problem: CameraProblem, initial: Unknowns) -> Unknowns:
+    """Calibration of one camera, for the initial value."""
     frozen = jax.lax.stop_gradient(problem)
     plain = eqx.tree_at(lambda p: p.loss, frozen, Quadratic())
-    return solve(plain, start, solver=LevenbergMarquardt(), max_steps=100).value
+    return solve(plain, initial, solver=LevenbergMarquardt(), max_steps=100).value
 
 
-def _join(alone: list[Unknowns], valid: list[Array]) -> Unknowns:
-    """The rig that the boards seen by both agree on in the mean, and all boards in the left camera's frame."""
-    left, right = (unknowns.boards for unknowns in alone)
+def _join(single: list[Unknowns], valid: list[Array]) -> Unknowns:
+    """Mean relative pose over boards that both cameras see, and all boards in the left camera's frame."""
+    left, right = (unknowns.boards for unknowns in single)
     seen_left, seen_right = (jnp.any(mask, axis=1) for mask in valid)
     both = (seen_left & seen_right).astype(left.translation.dtype)
     relative = jax.vmap(lambda a, b: a @ b.inverse())(left, right)
@@ -142,4 +142,4 @@ def _join(alone: list[Unknowns], valid: list[Array]) -> Unknowns:
         return jnp.where(only_right.reshape(-1, *([1] * (a.ndim - 1))), b, a)
 
     boards = jax.tree.map(choose, left, carried_over)
-    return Unknowns(Rig(alone[0].shared, alone[1].shared, mean), boards)
+    return Unknowns(Rig(single[0].shared, single[1].shared, mean), boards)

@@ -1,4 +1,4 @@
-"""A calibration in numbers that people read: parameters with standard deviations, and what is left over."""
+"""Summary of a calibration: parameters with standard deviations, and reprojection errors."""
 
 import equinox as eqx
 import jax
@@ -7,20 +7,20 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration.problem import project
-from jaxloc.refinement.calibration.zhang import safe_views
+from jaxloc.refinement.calibration.zhang import finite_views
 from jaxloc.sensors import KannalaBrandt, Pinhole
 from jaxloc.solvers import Estimate
 
-_GLASS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_BROWN_CONRADY = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 class Parameters(eqx.Module):
-    """Parameters of a camera with what is known of their errors.
+    """Parameters of a camera with their covariance.
 
     Attributes:
         names: ``fx``, ``fy``, ``cx``, ``cy``, ``skew``, and the coefficients of the lens.
         values: px, and plain numbers for the lens.
-        covariance: zero for what was held.
+        covariance: zero for fixed parameters.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -34,12 +34,12 @@ class Parameters(eqx.Module):
 
 
 class Errors(eqx.Module):
-    """What a calibration leaves over.
+    """Reprojection errors of a calibration.
 
     Attributes:
         errors: predicted minus measured corners, px; zero where masked.
-        valid: corners that count.
-        board_rms: root mean square of the distance, of each image, px; zero where it does not count.
+        valid: corners that are used.
+        board_rms: root mean square of the distance, of each image, px; zero for unused images.
         rms: of all.
     """
 
@@ -50,7 +50,7 @@ class Errors(eqx.Module):
 
 
 def camera_names(camera: Pinhole) -> tuple[str, ...]:
-    """Names of the numbers in the tangent of a camera.
+    """Names of the components of a camera's tangent.
 
     Example:
         >>> camera_names(Pinhole(1.0, 1.0, 0.0, 0.0))
@@ -58,7 +58,7 @@ def camera_names(camera: Pinhole) -> tuple[str, ...]:
     """
     lens = camera.lens
     size = 0 if lens is None else lens.coefficients.shape[0]  # pyright: ignore[reportAttributeAccessIssue]
-    names = ("k1", "k2", "k3", "k4") if isinstance(lens, KannalaBrandt) else _GLASS
+    names = ("k1", "k2", "k3", "k4") if isinstance(lens, KannalaBrandt) else _BROWN_CONRADY
     return ("fx", "fy", "cx", "cy", "skew", *names[:size])
 
 
@@ -90,19 +90,19 @@ def board_errors(
     *,
     valid: Bool[Array, "boards corners"] | None = None,
 ) -> Errors:
-    """Reprojection errors of boards, and their root mean squares (of the distance, as OpenCV counts).
+    """Reprojection errors of boards, and their root mean squares (of the distance, as in OpenCV).
 
     Args:
         camera: the camera.
         T_camera_board: a pose for each image.
         board: corners in the frame of the board, m.
-        corners: where they appear, px.
-        valid: corners that count.
+        corners: their measured pixels.
+        valid: corners that are used.
 
     Returns:
         Errors.
     """
-    views = safe_views(board, corners, valid)
+    views = finite_views(board, corners, valid)
     shown, _ = jax.vmap(lambda pose: project(camera, pose, views.board))(T_camera_board)
     errors = jnp.where(views.valid[:, None, :], shown - views.pixels, 0.0)
     squared = jnp.sum(errors**2, axis=1)

@@ -1,6 +1,6 @@
-"""Where a calibration starts: Zhang's closed form, from the homographies of a flat board.
+"""Zhang's closed-form calibration from homographies of a planar board: the initial value of `calibrate`.
 
-A start carries no derivatives (those of the answer are the minimum's), so singular value decompositions are safe here.
+It is not differentiated (the derivatives are those of the minimum), so that singular value decompositions are safe.
 """
 
 from typing import NamedTuple
@@ -17,12 +17,12 @@ _FEWEST_CORNERS = 6
 
 
 class Views(NamedTuple):
-    """Corners of a board in several images, made safe: finite everywhere.
+    """Corners of a board in several images, finite everywhere.
 
     Attributes:
         board: "3 m", frame of the board, m; points along the last axis.
         pixels: "n 2 m".
-        valid: corners that count; none of a board that shows too few of them.
+        valid: corners that are used; none of a board with too few of them.
     """
 
     board: Float[Array, "3 m"]
@@ -30,12 +30,12 @@ class Views(NamedTuple):
     valid: Bool[Array, "n m"]
 
     def used(self) -> Bool[Array, " n"]:
-        """Boards that count."""
+        """Boards that are used."""
         return jnp.any(self.valid, axis=1)
 
 
-class Guess(NamedTuple):
-    """A camera without lens, and where the boards are.
+class InitialCalibration(NamedTuple):
+    """A camera without lens distortion, and the poses of the boards.
 
     Attributes:
         focal: (fx, fy), px.
@@ -48,13 +48,13 @@ class Guess(NamedTuple):
     boards: SE3
 
 
-def safe_views(board: Float[Array, "m 3"], corners: Float[Array, "n m 2"], valid: Bool[Array, "n m"] | None) -> Views:
-    """The views with whatever is not finite masked and replaced."""
+def finite_views(board: Float[Array, "m 3"], corners: Float[Array, "n m 2"], valid: Bool[Array, "n m"] | None) -> Views:
+    """The views with non-finite corners masked and replaced."""
     finite = jnp.all(jnp.isfinite(corners), axis=2) & jnp.all(jnp.isfinite(board), axis=1)[None, :]
-    seen = finite if valid is None else finite & valid
-    seen = seen & (jnp.sum(seen, axis=1, keepdims=True) >= _FEWEST_CORNERS)
-    pixels = jnp.where(seen[:, :, None], corners, 0.0)
-    return Views(jnp.where(jnp.isfinite(board), board, 0.0).T, jnp.swapaxes(pixels, 1, 2), seen)
+    used = finite if valid is None else finite & valid
+    used = used & (jnp.sum(used, axis=1, keepdims=True) >= _FEWEST_CORNERS)
+    pixels = jnp.where(used[:, :, None], corners, 0.0)
+    return Views(jnp.where(jnp.isfinite(board), board, 0.0).T, jnp.swapaxes(pixels, 1, 2), used)
 
 
 def extent(views: Views, shape: tuple[int, int] | None) -> tuple[Float[Array, "2"], Float[Array, ""]]:
@@ -63,20 +63,20 @@ def extent(views: Views, shape: tuple[int, int] | None) -> tuple[Float[Array, "2
     if shape is not None:
         rows, columns = shape
         return jnp.asarray([0.5 * (columns - 1), 0.5 * (rows - 1)], dtype), jnp.asarray(0.5 * max(shape), dtype)
-    seen = views.valid[:, None, :]
-    low = jnp.min(jnp.where(seen, views.pixels, jnp.inf), axis=(0, 2))
-    high = jnp.max(jnp.where(seen, views.pixels, -jnp.inf), axis=(0, 2))
+    used = views.valid[:, None, :]
+    low = jnp.min(jnp.where(used, views.pixels, jnp.inf), axis=(0, 2))
+    high = jnp.max(jnp.where(used, views.pixels, -jnp.inf), axis=(0, 2))
     some = jnp.any(views.valid)
     low, high = jnp.where(some, low, 0.0), jnp.where(some, high, 1.0)
     return 0.5 * (low + high), jnp.maximum(0.5 * jnp.max(high - low), 1.0)
 
 
-def closed_form(views: Views, center: Float[Array, "2"], scale: Float[Array, ""]) -> Guess:
-    """The best of three closed forms, by what is left over.
+def closed_form(views: Views, center: Float[Array, "2"], scale: Float[Array, ""]) -> InitialCalibration:
+    """The best of three closed forms, by reprojection error.
 
     Zhang's linear equations for the image of the absolute conic: with the principal point unknown; with it at the
-    center of the images; and with one focal length besides. The first is exact without noise and lens, the last
-    still stands where the others are ruined by them.
+    center of the images; and with one focal length besides. The first is exact without noise and distortion, the last
+    is the most robust.
 
     References:
         Zhang, "A flexible new technique for camera calibration", T-PAMI 2000, section 3.1 [T-17].
@@ -86,13 +86,13 @@ def closed_form(views: Views, center: Float[Array, "2"], scale: Float[Array, ""]
     used = views.used()
     normalize = _similarity(center, scale)
     conics = jnp.where(used[:, None, None], jax.vmap(lambda h: _unit(matmul(normalize, h)))(matrices), 0.0)
-    guesses = [_zhang(conics), _centered(conics), _square(conics)]
-    focals = jnp.stack([focal for focal, _ in guesses]) * scale
-    centers = jnp.stack([shift for _, shift in guesses]) * scale + center[None, :]
+    candidates = [_zhang(conics), _centered(conics), _square(conics)]
+    focals = jnp.stack([focal for focal, _ in candidates]) * scale
+    centers = jnp.stack([shift for _, shift in candidates]) * scale + center[None, :]
 
     def attempt(focal: Array, point: Array) -> tuple[SE3, Array]:
         boards = jax.vmap(lambda h: _pose(h, focal, point))(matrices)
-        return boards, _misfit(views, Guess(focal, point, boards))
+        return boards, _misfit(views, InitialCalibration(focal, point, boards))
 
     boards, costs = jax.vmap(attempt)(focals, centers)
     best = jnp.argmin(jnp.where(jnp.isfinite(costs), costs, jnp.inf))
@@ -101,7 +101,7 @@ def closed_form(views: Views, center: Float[Array, "2"], scale: Float[Array, ""]
     boards = jax.tree.map(
         lambda leaf, idle: jnp.where(used.reshape(-1, *([1] * idle.ndim)), leaf, idle[None]), boards, rest
     )
-    return Guess(focals[best], centers[best], boards)
+    return InitialCalibration(focals[best], centers[best], boards)
 
 
 def _similarity(center: Float[Array, "2"], scale: Float[Array, ""]) -> Float[Array, "3 3"]:
@@ -126,7 +126,7 @@ def _equations(conics: Float[Array, "n 3 3"]) -> Float[Array, "k 5"]:
 
 
 def _root(value: Array) -> Array:
-    """Square root of what should be positive: nan where it is not, so that this form is not chosen."""
+    """Square root; nan for negative values, so that this form is not chosen."""
     return jnp.where(value > 0, jnp.sqrt(jnp.where(value > 0, value, 1.0)), jnp.nan)
 
 
@@ -150,7 +150,7 @@ def _centered(conics: Float[Array, "n 3 3"]) -> tuple[Float[Array, "2"], Float[A
 
 
 def _square(conics: Float[Array, "n 3 3"]) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-    """One focal length; that of a view of 53 degrees where even this fails."""
+    """One focal length; that of a field of view of 53 degrees where this fails."""
     rows = _equations(conics)
     a, right = rows[:, 0] + rows[:, 1], -rows[:, 4]
     inverse = jnp.sum(a * right) / jnp.sum(a * a)
@@ -160,7 +160,7 @@ def _square(conics: Float[Array, "n 3 3"]) -> tuple[Float[Array, "2"], Float[Arr
 
 
 def _pose(matrix: Float[Array, "3 3"], focal: Float[Array, "2"], center: Float[Array, "2"]) -> SE3:
-    """``T_camera_board`` of a homography ``K [r1 r2 t]``, the board ahead of the camera."""
+    """``T_camera_board`` of a homography ``K [r1 r2 t]``, the board in front of the camera."""
     h = (matrix - center_rows(matrix, center)) / jnp.concatenate([focal, jnp.ones(1, focal.dtype)])[:, None]
     size = 0.5 * (jnp.linalg.norm(h[:, 0]) + jnp.linalg.norm(h[:, 1]))
     size = jnp.where(h[2, 2] < 0, -size, size)
@@ -175,19 +175,19 @@ def _pose(matrix: Float[Array, "3 3"], focal: Float[Array, "2"], center: Float[A
 
 
 def center_rows(matrix: Float[Array, "3 3"], center: Float[Array, "2"]) -> Float[Array, "3 3"]:
-    """What a principal point adds to the rows of a homography."""
+    """Rows of a homography relative to a principal point."""
     return jnp.concatenate([center[:, None] * matrix[2:], jnp.zeros((1, 3), matrix.dtype)])
 
 
-def _misfit(views: Views, guess: Guess) -> Float[Array, ""]:
+def _misfit(views: Views, initial: InitialCalibration) -> Float[Array, ""]:
     """Root mean square of the pixel errors, infinite where a corner lies behind the camera."""
 
     def error(pose: SE3, pixels: Array, valid: Array) -> Array:
         x, y, z = matmul(pose.rotation.matrix(), views.board) + pose.translation[:, None]
-        ahead = z > 0
-        depth = jnp.where(ahead, z, 1.0)
-        shown = jnp.stack([x / depth, y / depth]) * guess.focal[:, None] + guess.center[:, None]
-        squared = jnp.where(ahead, jnp.sum((shown - pixels) ** 2, axis=0), jnp.inf)
+        in_front = z > 0
+        depth = jnp.where(in_front, z, 1.0)
+        predicted = jnp.stack([x / depth, y / depth]) * initial.focal[:, None] + initial.center[:, None]
+        squared = jnp.where(in_front, jnp.sum((predicted - pixels) ** 2, axis=0), jnp.inf)
         return jnp.sum(jnp.where(valid, squared, 0.0))
 
-    return jnp.sum(jax.vmap(error)(guess.boards, views.pixels, views.valid))
+    return jnp.sum(jax.vmap(error)(initial.boards, views.pixels, views.valid))

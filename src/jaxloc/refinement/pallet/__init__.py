@@ -1,4 +1,4 @@
-"""Find the pallet: fork-hole edges, the kind of pallet, and its pose [K-14, K-74, K-75, K-76]."""
+"""Pallet pose estimation from the vertical edges of its fork holes [K-14, K-74, K-75, K-76]."""
 
 from jaxloc.refinement.pallet import edges, estimate, kinds, model
 from jaxloc.refinement.pallet.edges import level_view

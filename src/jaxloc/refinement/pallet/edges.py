@@ -1,9 +1,9 @@
-"""Vertical edges of fork holes in an image: level view, column profiles, darkening and lightening pairs, candidates.
+"""Detection of the vertical edges of fork holes: level view, column profiles, edge pairs, candidates.
 
-The edges of a hole are principally vertical, and come in pairs: from the left, wood darkens to the hole and lightens
-again. Columns are therefore judged by the mean of the horizontal derivative over a band of rows, taken only where the
-gradient is principally horizontal. A level camera at a known height knows in which rows the holes of a pallet at a
-given range lie, so every range has its band.
+The edges of a hole are vertical and come in pairs: from the left, gray levels decrease to the hole and increase again.
+The profile of a column is the mean of the horizontal derivative over a band of rows, where the gradient is mainly
+horizontal. For a level camera at a known height, the rows of the holes depend on the range only, so every range has its
+band.
 """
 
 from typing import Any
@@ -20,18 +20,18 @@ from jaxloc.images.normalization import as_gray
 from jaxloc.refinement.pallet.model import PalletType
 from jaxloc.sensors import GroundCamera
 
-# Part of the height of a hole that is used: its rims are blurred.
+# Fraction of the height of a hole that is used, without its blurred rims.
 _INNER = 0.7
-_PARTS = 4  # of an edge, measured apart to see how they scatter
-_SMOOTHING = 1.0  # of the image before it is differentiated, px
+_PARTS = 4  # parts of an edge that are measured separately, for their scatter
+_SMOOTHING = 1.0  # Gaussian blur before differentiation, px
 
 
 class LevelView(eqx.Module):
-    """An image as a level camera without a lens would take it: columns tell bearings, rows elevations.
+    """An image rectified to a level camera without lens distortion: columns are bearings, rows elevations.
 
     Attributes:
         image: gray levels, smoothed by `smoothing`.
-        slope: horizontal derivative, zero where the gradient is not principally horizontal.
+        slope: horizontal derivative, zero where the gradient is not mainly horizontal.
         focal: px.
         middle: (column, row) of the horizontal ray straight ahead, px.
         height: of the camera over the ground, m.
@@ -44,7 +44,7 @@ class LevelView(eqx.Module):
     height: Float[Array, ""]
 
     def rows(self, level: Float[Array, "*n"], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Rows of points at a level above the ground (m) at a distance ahead (m)."""
+        """Rows of points at a height above the ground (m) and a distance (m)."""
         return self.middle[1] + self.focal * (self.height - level) / x
 
 
@@ -52,7 +52,7 @@ class Peaks(eqx.Module):
     """The strongest edges of one polarity in a profile.
 
     Attributes:
-        columns: to a fraction of a pixel.
+        columns: subpixel positions.
         strength: gray levels a pixel, zero in empty slots.
     """
 
@@ -61,7 +61,7 @@ class Peaks(eqx.Module):
 
 
 class Candidate(eqx.Module):
-    """Four edges that may be those of a pallet.
+    """Four edges of a candidate pallet.
 
     Attributes:
         columns: left to right, px.
@@ -73,12 +73,12 @@ class Candidate(eqx.Module):
 
 
 class MeasuredEdges(eqx.Module):
-    """Four edges, each measured in its own rows.
+    """Four edges, measured each in its own rows.
 
     Attributes:
         columns: left to right, px.
         strength: of the weakest, gray levels a pixel.
-        sigma: standard deviation of a column, px, as parts of the edges scatter.
+        sigma: standard deviation of a column, px, from the scatter of parts of the edges.
     """
 
     columns: Float[Array, "4"]
@@ -88,14 +88,14 @@ class MeasuredEdges(eqx.Module):
 
 @eqx.filter_jit
 def level_view(image: Any, camera: GroundCamera) -> LevelView:
-    """What a level camera without a lens would see from the same place.
+    """Rectifies an image to a level camera without lens distortion.
 
     Args:
-        image: gray image, bytes too.
-        camera: that took it, with lens, height, pitch and roll.
+        image: grayscale image of any dtype.
+        camera: with lens, height, pitch and roll.
 
     Returns:
-        A view of the same size, whose rows are turned so far that the middle of the image stays where it was.
+        A view of the same size with the same center.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -116,25 +116,25 @@ def level_view(image: Any, camera: GroundCamera) -> LevelView:
     x, y, z = (axes[0, i] + axes[1, i] * left + axes[2, i] * up for i in range(3))
     places = jnp.stack([c.reshape(-1) for c in camera.camera.project_components(x, y, z)], axis=1)
     level = sample(gray, places)
-    seen = level.inside.reshape(gray.shape)
+    inside = level.inside.reshape(gray.shape)
     smoothed = smooth(level.values.reshape(gray.shape), _SMOOTHING)
-    return LevelView(smoothed, _principal(smoothed, seen), focal, middle, camera.height)
+    return LevelView(smoothed, _principal(smoothed, inside), focal, middle, camera.height)
 
 
-def _principal(image: Float[Array, "h w"], seen: Bool[Array, "h w"]) -> Float[Array, "h w"]:
-    """Horizontal derivative where it is the principal one, zero beside the image."""
+def _principal(image: Float[Array, "h w"], inside: Bool[Array, "h w"]) -> Float[Array, "h w"]:
+    """Horizontal derivative where the gradient is mainly horizontal, zero outside the image."""
     slope = central_difference(image)
-    whole = smooth(jnp.where(seen, 1.0, 0.0).astype(image.dtype), 1.0) > 0.999
+    whole = smooth(jnp.where(inside, 1.0, 0.0).astype(image.dtype), 1.0) > 0.999
     return jnp.where(whole & (jnp.abs(slope.right) >= jnp.abs(slope.down)), slope.right, 0.0)
 
 
 def summed(slope: Float[Array, "h w"]) -> Float[Array, "h1 w"]:
-    """Sums of the rows above each row: the mean over any band is then two look-ups."""
+    """Cumulative sums of rows: the mean over any band is the difference of two."""
     return jnp.concatenate([jnp.zeros_like(slope[:1]), jnp.cumsum(slope, axis=0)])
 
 
 def band_profile(sums: Float[Array, "h1 w"], top: Float[Array, ""], bottom: Float[Array, ""]) -> Float[Array, " w"]:
-    """Mean of each column between two rows, parts of rows included; zero for bands that are not in the image."""
+    """Mean of each column between two rows, with fractions of rows; zero for bands outside the image."""
     high, low = (jnp.clip(row + 0.5, 0.0, sums.shape[0] - 1.0) for row in (top, bottom))
     inside = (low - high) > 0.5 * (bottom - top)
 
@@ -149,17 +149,17 @@ def band_profile(sums: Float[Array, "h1 w"], top: Float[Array, ""], bottom: Floa
 
 
 def hole_band(view: LevelView, kind: PalletType, x: Float[Array, ""]) -> Float[Array, "2"]:
-    """First and last row of the inner part of the holes of a pallet at a distance ahead."""
+    """First and last row of the inner part of the holes of a pallet at a distance."""
     middle = kind.hole_bottom + 0.5 * kind.hole_height
     half = 0.5 * _INNER * kind.hole_height
     return jnp.stack([view.rows(middle + half, x), view.rows(middle - half, x)])
 
 
-def strongest(profile: Float[Array, " w"], count: int) -> Peaks:
-    """The highest peaks of a profile, their places by the parabola through the logarithms of three columns.
+def strongest_edges(profile: Float[Array, " w"], count: int) -> Peaks:
+    """The highest peaks of a profile, refined by a parabola through the logarithms of three columns.
 
-    The derivative of a blurred step is a Gaussian, whose logarithm is a parabola: the place has no bias. Places carry
-    derivatives by the profile; which columns are peaks does not change.
+    The derivative of a blurred step is a Gaussian, whose logarithm is a parabola: there is no bias. The positions have
+    derivatives by the profile, for fixed columns of the peaks.
     """
     height = jnp.pad(profile, 1)
     middle = height[1:-1]
@@ -171,7 +171,7 @@ def strongest(profile: Float[Array, " w"], count: int) -> Peaks:
 
 
 def peak_near(profile: Float[Array, " w"], column: Float[Array, ""], radius: int) -> Peaks:
-    """The highest place of a profile within some pixels of a column, as a set of one."""
+    """The highest peak of a profile within some pixels of a column, as a set of one."""
     width = profile.shape[0]
     places = jnp.arange(width, dtype=profile.dtype)
     near = jnp.abs(places - lax.stop_gradient(column)) <= radius
@@ -190,37 +190,37 @@ def _vertex(height: Float[Array, " w2"], index: Int[Array, " k"]) -> Float[Array
     values = [height[index + shift] for shift in range(3)]
     floor = jnp.maximum(1e-3 * values[1], float(jnp.finfo(height.dtype).tiny))
     left, middle, right = (jnp.log(jnp.maximum(value, floor)) for value in values)
-    bend = left - 2.0 * middle + right
-    curved = bend < -1e-6
-    shift = jnp.where(curved, 0.5 * (left - right) / jnp.where(curved, bend, 1.0), 0.0)
+    curvature = left - 2.0 * middle + right
+    curved = curvature < -1e-6
+    shift = jnp.where(curved, 0.5 * (left - right) / jnp.where(curved, curvature, 1.0), 0.0)
     return index.astype(height.dtype) + jnp.clip(shift, -1.0, 1.0)
 
 
 def best_candidate(profile: Float[Array, " w"], kind: PalletType, span: Float[Array, ""], count: int) -> Candidate:
-    """The four edges with the strongest weakest one that fit a kind of pallet seen over some columns [K-74].
+    """The four edges that fit a kind of pallet with the greatest strength of the weakest edge [K-74].
 
-    Darkening, lightening, darkening, lightening from the left; ``hole width : separation`` as the kind has it, which no
-    range changes; both holes of nearly one width; and a span that a pallet turned by up to 45 degrees may have.
+    The polarities alternate from the left; ``hole width : separation`` is that of the kind, at any range; both holes
+    have nearly the same width; and the span is that of a pallet rotated by up to 45 degrees.
 
     Args:
         profile: mean horizontal derivative of the columns, gray levels a pixel.
         kind: of pallet.
-        span: columns between the outer edges of a pallet that faces the camera, px.
-        count: edges of each polarity that are tried; static.
+        span: columns between the outer edges of a frontal pallet, px.
+        count: candidates of each polarity; static.
 
     Returns:
         The candidate.
     """
-    dark, light = strongest(-profile, count), strongest(profile, count)
+    dark, light = strongest_edges(-profile, count), strongest_edges(profile, count)
     a, b = dark.columns[:, None, None, None], light.columns[None, :, None, None]
     c, d = dark.columns[None, None, :, None], light.columns[None, None, None, :]
     left, gap, right = b - a, c - b, d - c
     ordered = (left > 1.0) & (gap > 1.0) & (right > 1.0)
     left, gap, right = (jnp.where(ordered, part, 1.0) for part in (left, gap, right))
     ratio = 0.5 * (left + right) / gap
-    seen = (d - a) / span
+    foreshortening = (d - a) / span
     fits = ordered & (jnp.abs(jnp.log(ratio / kind.ratio())) < 0.15) & (jnp.abs(jnp.log(left / right)) < 0.5)
-    fits = fits & (seen > 0.6) & (seen < 1.2)
+    fits = fits & (foreshortening > 0.6) & (foreshortening < 1.2)
     weakest = jnp.minimum(
         jnp.minimum(dark.strength[:, None, None, None], light.strength[None, :, None, None]),
         jnp.minimum(dark.strength[None, None, :, None], light.strength[None, None, None, :]),
@@ -234,14 +234,14 @@ def best_candidate(profile: Float[Array, " w"], kind: PalletType, span: Float[Ar
 def edges_along(
     view: LevelView, sums: Float[Array, "h1 w"], kind: PalletType, columns: Float[Array, "4"], x: Float[Array, "4"]
 ) -> MeasuredEdges:
-    """Four edges measured anew, each in the rows where its own distance puts the hole.
+    """Measures four edges again, each in the rows of the hole at its own distance.
 
     Args:
         view: the image.
         sums: of its `slope`, by `summed`.
         kind: of pallet.
-        columns: where the edges are expected, px.
-        x: how far ahead each edge is, m.
+        columns: expected positions, px.
+        x: distance of each edge, m.
 
     Returns:
         The edges.
@@ -250,7 +250,7 @@ def edges_along(
     parts = jnp.arange(_PARTS + 1, dtype=sums.dtype) / _PARTS
 
     def one(column: Array, distance: Array, sign: Array) -> tuple[Peaks, Array]:
-        # Whole rows: which rows are read is no part of the derivatives.
+        # Whole rows, which do not depend on the state in derivatives.
         band = jnp.round(lax.stop_gradient(hole_band(view, kind, distance)))
 
         def within(top: Array, bottom: Array) -> Peaks:
@@ -261,6 +261,6 @@ def edges_along(
 
     whole, quarters = jax.vmap(one)(columns, x, signs)
     quarters = lax.stop_gradient(quarters)
-    # Four edges pool their scatter: one edge alone has three numbers to tell it by.
+    # The scatter is pooled over four edges: one edge alone has three degrees of freedom.
     scatter = jnp.sum((quarters - jnp.mean(quarters, axis=1, keepdims=True)) ** 2) / (4 * (_PARTS - 1))
     return MeasuredEdges(whole.columns[:, 0], jnp.min(whole.strength), jnp.sqrt(scatter / _PARTS))

@@ -1,8 +1,8 @@
-"""Find the pallet: from an image to the pose of the pallet in it, or the word that there is none [K-14].
+"""Detection of a pallet in an image, and its pose [K-14].
 
-Edges of fork holes are proposed at a ladder of ranges, four of them picked by polarity and by the ratio of hole width
-to separation, a pose fitted to them, and the front of each kind compared with the image there. The best one has its
-edges measured anew, each in its own rows, before the final pose.
+At each of several ranges, four edges of fork holes are selected by polarity and by the ratio of hole width to
+separation, a pose is fitted to them, and the image is correlated with the front of each kind there. The edges of the
+best candidate are measured again, each in its own rows, before the final pose.
 """
 
 from typing import Any
@@ -30,15 +30,15 @@ from jaxloc.solvers import Estimate, Status
 
 
 class PalletSearch(eqx.Module):
-    """Where and how to look for pallets.
+    """Options of pallet detection.
 
     Attributes:
         nearest: range, m; static.
         farthest: range, m; static.
-        ranges: how many ranges are tried, evenly spaced in their inverse; static.
-        edges: of each polarity that are tried at a range; static.
-        sigma: what the columns of edges are off beside their scatter, px: worn wood, a camera not quite level.
-        tolerance: how badly four edges may fit one pose, px.
+        ranges: number of ranges, evenly spaced in their inverse; static.
+        edges: candidates of each polarity at a range; static.
+        sigma: standard deviation of errors of edges beside their scatter, px: damaged wood, a camera not quite level.
+        tolerance: greatest residual of four edges, px.
         least_strength: of an edge, gray levels a pixel.
         least_correlation: with the front of the kind.
     """
@@ -54,10 +54,10 @@ class PalletSearch(eqx.Module):
 
 
 class FoundPallet(eqx.Module):
-    """What `detect_pallet` saw.
+    """Result of `detect_pallet`.
 
     Attributes:
-        estimate: of ``T_ground_pallet``; ``ok`` is False where no pallet of the kinds asked for was found.
+        estimate: of ``T_ground_pallet``; ``ok`` is False where no pallet of the given kinds was found.
         kind: index of the kind that fits best.
         correlation: of the image with the front of each kind, each at the pose that fits it best.
         columns: of the four edges in the level view, px.
@@ -85,18 +85,18 @@ def find_pallet(
     *,
     search: PalletSearch = PalletSearch(),
 ) -> Estimate:
-    """The pose of a pallet in an image.
+    """Pose of a pallet in an image.
 
     Args:
-        image: gray levels, bytes too.
-        camera: that took it: lens, height, pitch and roll.
-        types: kinds of pallets that may be there.
-        search: where and how to look.
+        image: gray levels of any dtype.
+        camera: lens, height, pitch and roll.
+        types: kinds of pallets.
+        search: options.
 
     Returns:
         Estimate of the pose ``T_ground_pallet`` of the middle of its face on the ground: x forward, y left of the
         camera's foot, heading of the way forks go in. ``ok`` is False when there is no pallet of these kinds, or when
-        it is not certain. Derivatives by the image are those of the four edges that were found.
+        detection is not certain. Derivatives by the image are those of the four edges that were found.
 
     Raises:
         ValueError: no types.
@@ -122,16 +122,16 @@ def detect_pallet(
     *,
     search: PalletSearch = PalletSearch(),
 ) -> FoundPallet:
-    """`find_pallet` with the kind, the correlations and the edges.
+    """Detection of a pallet: pose, kind, correlations and edges.
 
     Args:
-        image: gray levels, bytes too.
-        camera: that took it.
-        types: kinds of pallets that may be there.
-        search: where and how to look.
+        image: gray levels of any dtype.
+        camera: of the image.
+        types: kinds of pallets.
+        search: options.
 
     Returns:
-        What was seen.
+        The result.
 
     Raises:
         ValueError: no types.
@@ -153,7 +153,7 @@ def detect_pallet(
 
 
 def _propose(view: LevelView, sums: Array, kind: PalletType, search: PalletSearch) -> _Proposal:
-    """The pose of one kind whose front the image resembles most, of the best four edges at each range."""
+    """The pose of the highest correlation of one kind, among those of the best four edges at each range."""
     inverse = jnp.linspace(1.0 / search.nearest, 1.0 / search.farthest, search.ranges, dtype=sums.dtype)
 
     def at_range(x: Float[Array, ""]) -> _Proposal:
@@ -161,9 +161,9 @@ def _propose(view: LevelView, sums: Array, kind: PalletType, search: PalletSearc
         profile = band_profile(sums, band[0], band[1])
         edges = kind.edges()
         found = best_candidate(profile, kind, view.focal * (edges[0] - edges[3]) / x, search.edges)
-        # In units of the tolerance; the ranges are coarse, and their rows not those of every edge.
+        # In units of the tolerance; the ranges are coarse, and their rows do not fit every edge exactly.
         fit = _fit(view, kind, found.columns, found.strength > 0, search.tolerance)
-        # The rows that were looked at have to be those of a pallet where this one is.
+        # The rows of this range must be those of a pallet at this pose.
         agrees = jnp.abs(jnp.log(jnp.where(fit.ok, fit.value.x, 1.0) / x)) < 0.4
         plausible = fit.ok & agrees & (found.strength > search.least_strength) & (fit.cost < 12.5)
         correlation = type_correlation(view, kind, fit.value)
@@ -175,20 +175,20 @@ def _propose(view: LevelView, sums: Array, kind: PalletType, search: PalletSearc
 
 
 def _fit(view: LevelView, kind: PalletType, columns: Float[Array, "4"], some: Array, sigma: Any) -> Estimate:
-    """The pose that four edges tell; without edges a pallet far ahead, not ok."""
-    spread = jnp.arange(4, dtype=columns.dtype)
-    columns = jnp.where(some, columns, view.middle[0] + spread)
+    """The pose from four edges; without edges that of a distant pallet, not ok."""
+    separate = jnp.arange(4, dtype=columns.dtype)
+    columns = jnp.where(some, columns, view.middle[0] + separate)
     valid = jnp.broadcast_to(some, (4,))
     return pose_from_edges(kind, view.middle[0] - columns, view.focal, sigma=sigma, valid=valid)
 
 
 def _distances(pose: SE2, kind: PalletType) -> Float[Array, "4"]:
-    """How far ahead the edges are, m; a hand's breadth at least."""
+    """Distances of the edges along x, m, bounded below."""
     return jnp.maximum(pose.rotation.matrix()[0, 1] * kind.edges() + pose.x, 0.1)
 
 
 def _rejected(estimate: Estimate, good: Array) -> Estimate:
-    """The estimate, not ok where it is not good."""
+    """The estimate, not ok where the condition is False."""
     ok = estimate.ok & good
     status = jnp.where(estimate.ok & ~good, int(Status.INADMISSIBLE), estimate.status).astype(estimate.status.dtype)
     return eqx.tree_at(lambda e: (e.ok, e.status), estimate, (ok, status))

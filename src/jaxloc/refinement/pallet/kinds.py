@@ -1,4 +1,4 @@
-"""Which kind of pallet a face is: the correlation with an image of each kind's front, drawn by its measures [K-75]."""
+"""Classification of pallets by correlation with rendered templates of the fronts [K-75]."""
 
 import equinox as eqx
 import jax
@@ -12,12 +12,12 @@ from jaxloc.refinement.pallet.edges import LevelView
 from jaxloc.refinement.pallet.model import PalletType
 
 _ROWS, _COLUMNS = 24, 128
-_MARGIN = 1.08  # width of the template over that of the face: what is beside the face counts too
+_MARGIN = 1.08  # width of the template over that of the face, to include the background beside it
 
 
 @eqx.filter_jit
 def face_template(kind: PalletType) -> Float[Array, "24 128"]:
-    """The front of a pallet: one where there is wood, zero in the holes and beside the face.
+    """Template of the front of a pallet: one for wood, zero in the holes and beside the face.
 
     Example:
         >>> from jaxloc.refinement.pallet import euro_long, face_template
@@ -34,11 +34,11 @@ def face_template(kind: PalletType) -> Float[Array, "24 128"]:
 
 @eqx.filter_jit
 def view_face(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, "24 128"]:
-    """What the image shows where the face of a pallet would be, sampled along the face.
+    """The image at the face of a pallet with a given pose, sampled along the face.
 
     Args:
         view: the image.
-        kind: whose measures to take.
+        kind: of pallet.
         pose: ``T_ground_pallet``.
 
     Returns:
@@ -47,18 +47,18 @@ def view_face(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, "24 
     along, level = _grid(kind)
     rotation = pose.rotation.matrix()
     x, y = (rotation[i, 1] * along + pose.translation[i] for i in range(2))
-    ahead = x > 0.05
-    x, y = jnp.where(ahead, x, 1.0), jnp.where(ahead, y, 0.0)
+    in_front = x > 0.05
+    x, y = jnp.where(in_front, x, 1.0), jnp.where(in_front, y, 0.0)
     u = jnp.broadcast_to((view.middle[0] - view.focal * y / x)[None, :], (_ROWS, _COLUMNS))
     v = view.rows(*(jnp.broadcast_to(c, u.shape) for c in (level[:, None], x[None, :])))
     read = sample(view.image, jnp.stack([u.reshape(-1), v.reshape(-1)], axis=1))
-    shown = (read.inside & jnp.broadcast_to(ahead[None, :], u.shape).reshape(-1)).reshape(u.shape)
-    return jnp.where(shown, read.values.reshape(u.shape), jnp.nan)
+    visible = (read.inside & jnp.broadcast_to(in_front[None, :], u.shape).reshape(-1)).reshape(u.shape)
+    return jnp.where(visible, read.values.reshape(u.shape), jnp.nan)
 
 
 @eqx.filter_jit
 def type_correlation(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, ""]:
-    """Normalized correlation of the image at a pose with the front of a kind: one for what is drawn by its measures.
+    """Normalized correlation of the image at a pose with the template of a kind.
 
     Args:
         view: the image.
@@ -72,12 +72,12 @@ def type_correlation(view: LevelView, kind: PalletType, pose: SE2) -> Float[Arra
         KELLY 9.2.4.2.2, templates correlated to identify the type [K-75].
     """
     face = view_face(view, kind, pose)
-    shown = jnp.isfinite(face)
+    visible = jnp.isfinite(face)
     template = face_template(kind).astype(face.dtype)
-    count = jnp.maximum(jnp.sum(shown), 1).astype(face.dtype)
-    a = standardize(jnp.where(shown, face, 0.0), valid=shown)
-    b = standardize(template, valid=shown)
-    return jnp.where(jnp.mean(shown.astype(face.dtype)) > 0.8, jnp.sum(a * b) / count, 0.0)
+    count = jnp.maximum(jnp.sum(visible), 1).astype(face.dtype)
+    a = standardize(jnp.where(visible, face, 0.0), valid=visible)
+    b = standardize(template, valid=visible)
+    return jnp.where(jnp.mean(visible.astype(face.dtype)) > 0.8, jnp.sum(a * b) / count, 0.0)
 
 
 @eqx.filter_jit
@@ -107,7 +107,7 @@ def stack_types(kinds: tuple[PalletType, ...]) -> PalletType:
 
 
 def _grid(kind: PalletType) -> tuple[Float[Array, "128"], Float[Array, "24"]]:
-    """Places along the face, from left to right, and levels, from above."""
+    """Positions along the face, from left to right, and heights, from above."""
     dtype = kind.hole_width.dtype
     right = (jnp.arange(_COLUMNS, dtype=dtype) + 0.5) / _COLUMNS
     down = (jnp.arange(_ROWS, dtype=dtype) + 0.5) / _ROWS

@@ -1,8 +1,8 @@
-"""What a pallet looks like from the front, and the pose that four edges of its fork holes tell.
+"""Geometry of pallets, and their pose from the four vertical edges of the fork holes.
 
 The pallet stands on the ground before a level camera. Frames of the ground have x forward and y left; that of the
 pallet has its origin in the middle of the face, x in the direction in which forks enter and y along the face to the
-left. A vertical edge of the face then appears in the column of a level camera that its bearing alone tells:
+left. The column of a vertical edge in the image of a level camera depends on its bearing only:
 ``y_i = f y / x``, left of the principal point.
 
 References:
@@ -20,12 +20,12 @@ from jaxloc.poses import SE2
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Problem, Quadratic, solve
 
-_NEAREST = 0.05  # edges nearer than this to the plane of the camera have no image, m
-_UNSEEN = 1e3
+_NEAREST = 0.05  # least distance of edges from the plane of the camera, m
+_HIDDEN = 1e3
 
 
 class PalletType(eqx.Module):
-    """The front of a kind of pallet: two fork holes beside a block in the middle of a face that stands on the ground.
+    """Front of a kind of pallet: two fork holes beside a central block of a face that stands on the ground.
 
     Args:
         hole_width: of each hole, m.
@@ -56,12 +56,12 @@ class PalletType(eqx.Module):
         self.hole_width, self.separation, self.hole_bottom, self.hole_height, self.face_width, self.face_height = sizes
 
     def edges(self) -> Float[Array, "4"]:
-        """Where the four vertical edges lie along the face, from left (positive) to right, m."""
+        """Positions of the four vertical edges along the face, from left (positive) to right, m."""
         inner, outer = 0.5 * self.separation, 0.5 * self.separation + self.hole_width
         return jnp.stack([outer, inner, -inner, -outer])
 
     def ratio(self) -> Float[Array, ""]:
-        """Hole width over separation: in the image it hardly depends on range [K-74]."""
+        """Hole width over separation, nearly independent of range in the image [K-74]."""
         return self.hole_width / self.separation
 
 
@@ -81,13 +81,13 @@ def block_narrow() -> PalletType:
 
 
 def hole_ratio(bearings: Float[Array, "4"]) -> Float[Array, ""]:
-    """Mean width of the holes over their separation, seen: constant over range for a pallet that faces the camera.
+    """Mean width of the holes over their separation in the image; independent of range for a frontal view.
 
     Args:
         bearings: the four edges in the image, left to right, any unit and sign.
 
     Returns:
-        The ratio, zero where the holes are not apart.
+        The ratio, zero where the separation is zero.
 
     References:
         KELLY 9.2.4.2.2, scale-independent ratio of hole width to hole separation [K-74].
@@ -98,14 +98,14 @@ def hole_ratio(bearings: Float[Array, "4"]) -> Float[Array, ""]:
         1.0
     """
     gap = bearings[1] - bearings[2]
-    apart = gap != 0
+    distinct = gap != 0
     return jnp.where(
-        apart, 0.5 * (bearings[0] - bearings[1] + bearings[2] - bearings[3]) / jnp.where(apart, gap, 1.0), 0
+        distinct, 0.5 * (bearings[0] - bearings[1] + bearings[2] - bearings[3]) / jnp.where(distinct, gap, 1.0), 0
     )
 
 
 def cross_ratio(bearings: Float[Array, "4"]) -> Float[Array, ""]:
-    """``(a - c)(b - d) / ((b - c)(a - d))``: the same from every pose, turned pallets too; zero where undefined.
+    """``(a - c)(b - d) / ((b - c)(a - d))``: invariant to the pose; zero where undefined.
 
     Example:
         >>> import jax.numpy as jnp
@@ -120,7 +120,7 @@ def cross_ratio(bearings: Float[Array, "4"]) -> Float[Array, ""]:
 
 @eqx.filter_jit
 def edge_bearings(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[Array, " n"]:
-    """Where vertical edges of a pallet appear: ``y_i = f y / x`` px left of the principal column [K-76].
+    """Bearings of vertical edges of a pallet in the image: ``y_i = f y / x`` px left of the principal column [K-76].
 
     Args:
         pose: of the pallet in the ground frame below the camera, ``T_ground_pallet``.
@@ -128,7 +128,7 @@ def edge_bearings(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[Arr
         focal: of the level camera, px.
 
     Returns:
-        Bearings, px, positive to the left; zero for edges that are not ahead.
+        Bearings, px, positive to the left; zero for edges that are not in front.
 
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
@@ -136,13 +136,13 @@ def edge_bearings(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[Arr
         >>> edge_bearings(jl.poses.SE2(2.0, 0.5, 0.0), jnp.array([0.5, -0.5]), 100.0).tolist()
         [50.0, 0.0]
     """
-    x, y, ahead = _places(pose, edges)
-    return jnp.where(ahead, focal * y / x, 0.0)
+    x, y, in_front = _places(pose, edges)
+    return jnp.where(in_front, focal * y / x, 0.0)
 
 
 @eqx.filter_jit
 def printed_jacobian(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[Array, "3 n"]:
-    """Derivative of the bearings by the (x, y, heading) of the pallet as the lecture prints it, edges last.
+    """Derivative of the bearings by the pallet's (x, y, heading) as printed in the lecture, edges last.
 
     ``H = [-f y_d / x_d^2, f / x_d] [[1, 0, -(y_d - y_m)], [0, 1, x_d - x_m]]`` for the place (x_d, y_d) of an edge and
     that of the pallet (x_m, y_m), both in the frame of the camera.
@@ -153,7 +153,7 @@ def printed_jacobian(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[
         focal: px.
 
     Returns:
-        "3 n", zero for edges that are not ahead.
+        "3 n", zero for edges that are not in front.
 
     References:
         KELLY 9.2.4.2.2 [K-76]; the second factor is the compound-left Jacobian.
@@ -164,20 +164,20 @@ def printed_jacobian(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[
         >>> printed_jacobian(jl.poses.SE2(2.0, 0.0, 0.0), jnp.array([0.5]), 100.0)[:, 0].tolist()
         [-12.5, 50.0, 6.25]
     """
-    x, y, ahead = _places(pose, edges)
+    x, y, in_front = _places(pose, edges)
     by_x, by_y = -focal * y / (x * x), focal / x
     turn = -by_x * (y - pose.y) + by_y * (x - pose.x)
-    return jnp.where(ahead[None, :], jnp.stack([by_x, by_y, turn]), 0.0)
+    return jnp.where(in_front[None, :], jnp.stack([by_x, by_y, turn]), 0.0)
 
 
 class PalletEdges(Problem):
-    """Bearings of edges of a pallet; the state is its pose ``T_ground_pallet``.
+    """Least-squares problem of bearings of a pallet's edges; the state is its pose ``T_ground_pallet``.
 
     Attributes:
         edges: along the face, m.
         bearings: measured, px left of the principal column; finite.
         focal: px.
-        whitening: one over the standard deviation of a bearing; zero for edges that do not count.
+        whitening: one over the standard deviation of a bearing; zero for masked edges.
         loss: robust kernel.
     """
 
@@ -188,22 +188,22 @@ class PalletEdges(Problem):
     loss: Any = Quadratic()
 
     def residual(self, state: SE2) -> Float[Array, "1 n"]:
-        """Whitened errors of bearings; dear where the edge is not ahead."""
-        _, _, ahead = _places(state, self.edges)
+        """Whitened errors of bearings; a large constant where the edge is not in front."""
+        _, _, in_front = _places(state, self.edges)
         error = (edge_bearings(state, self.edges, self.focal) - self.bearings) * self.whitening
-        return jnp.where(ahead, error, jnp.where(self.whitening > 0, _UNSEEN, 0.0).astype(error.dtype))[None, :]
+        return jnp.where(in_front, error, jnp.where(self.whitening > 0, _HIDDEN, 0.0).astype(error.dtype))[None, :]
 
     def linearize(self, state: SE2) -> Linearization:
-        """With the printed Jacobian, its translation turned into the axes of the pallet."""
+        """With the printed Jacobian, its translation rotated into the axes of the pallet."""
         slope = printed_jacobian(state, self.edges, self.focal)
-        turned = jnp.concatenate([matmul(state.rotation.matrix().T, slope[:2]), slope[2:]])
-        return Linearization(self.residual(state), (turned * self.whitening[None, :])[:, None, :])
+        rotated = jnp.concatenate([matmul(state.rotation.matrix().T, slope[:2]), slope[2:]])
+        return Linearization(self.residual(state), (rotated * self.whitening[None, :])[:, None, :])
 
     def admissible(self, state: SE2) -> Bool[Array, ""]:
-        """Whether all edges are ahead and the face is turned to the camera."""
-        _, _, ahead = _places(state, self.edges)
+        """Whether all edges are in front of the camera and the face is towards it."""
+        _, _, in_front = _places(state, self.edges)
         normal = jnp.sum(state.rotation.matrix()[:, 0] * state.translation)
-        return jnp.all(ahead | (self.whitening <= 0)) & (normal > 0)
+        return jnp.all(in_front | (self.whitening <= 0)) & (normal > 0)
 
 
 @eqx.filter_jit
@@ -216,7 +216,7 @@ def pose_from_edges(
     sigma: Any = 0.1,
     valid: Bool[Array, "4"] | None = None,
 ) -> Estimate:
-    """The pose of a pallet from the bearings of the four vertical edges of its fork holes.
+    """Pose of a pallet from the bearings of the four vertical edges of its fork holes.
 
     Minimizes ``sum (f y_k / x_k - y_i,k)^2 / (2 sigma^2)`` with a step that is shortened until the cost falls.
 
@@ -224,22 +224,22 @@ def pose_from_edges(
         kind: of pallet.
         bearings: of the edges from left to right, px left of the principal column.
         focal: px.
-        initial: where to start; by default a pallet that faces the camera, as far as its width tells.
+        initial: ``T_ground_pallet``; by default a frontal pallet at the distance that its width gives.
         sigma: standard deviation of a bearing, px: a number or one an edge.
-        valid: edges that count; three at least. Numbers that are not finite never do.
+        valid: edges that are used, at least three; non-finite ones never are.
 
     Returns:
-        Estimate of ``T_ground_pallet``. ``ok`` is False with fewer than three edges, or when the pallet would stand
-        behind the camera or show its back.
+        Estimate of ``T_ground_pallet``. ``ok`` is False with fewer than three edges, or when the pallet would be
+        behind the camera or seen from the back.
 
     References:
-        KELLY 9.2.4.2.2: four stacked residuals, whose gradient points the way in line search [K-76].
+        KELLY 9.2.4.2.2: four stacked residuals, minimized by line search along the gradient [K-76].
 
     Example:
         >>> import jaxloc as jl
         >>> from jaxloc.refinement.pallet import edge_bearings, euro_long, pose_from_edges
-        >>> seen = edge_bearings(jl.poses.SE2(2.0, 0.3, 0.2), euro_long().edges(), 800.0)
-        >>> fit = pose_from_edges(euro_long(), seen, 800.0)
+        >>> bearings = edge_bearings(jl.poses.SE2(2.0, 0.3, 0.2), euro_long().edges(), 800.0)
+        >>> fit = pose_from_edges(euro_long(), bearings, 800.0)
         >>> bool(fit.ok), round(float(fit.value.x), 3), round(float(fit.value.theta), 3)
         (True, 2.0, 0.2)
     """
@@ -250,25 +250,25 @@ def pose_from_edges(
     sigmas = jnp.broadcast_to(jnp.asarray(sigma, dtype), bearings.shape)
     focal, edges = jnp.asarray(focal, dtype), kind.edges().astype(dtype)
     whitening = jnp.where(usable, 1.0 / jnp.where(usable, sigmas, 1.0), 0.0)
-    start = _facing(edges, bearings, focal, usable) if initial is None else initial
-    return solve(PalletEdges(edges, bearings, focal, whitening), start, solver=LevenbergMarquardt())
+    first = _frontal(edges, bearings, focal, usable) if initial is None else initial
+    return solve(PalletEdges(edges, bearings, focal, whitening), first, solver=LevenbergMarquardt())
 
 
-def _facing(edges: Array, bearings: Array, focal: Array, usable: Array) -> SE2:
-    """A pallet that faces the camera, by a straight line through bearings over edges."""
+def _frontal(edges: Array, bearings: Array, focal: Array, usable: Array) -> SE2:
+    """A frontal pallet, by a straight line through bearings over edges."""
     count = jnp.maximum(jnp.sum(usable), 1).astype(edges.dtype)
-    middle, seen = (jnp.sum(jnp.where(usable, v, 0.0)) / count for v in (edges, bearings))
+    middle, mean = (jnp.sum(jnp.where(usable, v, 0.0)) / count for v in (edges, bearings))
     across = jnp.where(usable, edges - middle, 0.0)
-    spread = jnp.sum(across**2)
-    scale = jnp.sum(across * (bearings - seen)) / jnp.where(spread > 0, spread, 1.0)
-    # A pixel over the width at least, so that the start is finite.
+    variance = jnp.sum(across**2)
+    scale = jnp.sum(across * (bearings - mean)) / jnp.where(variance > 0, variance, 1.0)
+    # At least a pixel over the width, so that the initial pose is finite.
     x = focal / jnp.maximum(scale, 1.0)
-    return SE2(x, seen * x / focal - middle, jnp.zeros_like(x))
+    return SE2(x, mean * x / focal - middle, jnp.zeros_like(x))
 
 
 def _places(pose: SE2, edges: Float[Array, " n"]) -> tuple[Array, Array, Bool[Array, " n"]]:
-    """Edges in the frame of the camera, safe where they are not ahead of it, and where they are."""
+    """Edges in the frame of the camera, finite where they are not in front of it, and the mask of those in front."""
     rotation = pose.rotation.matrix()
     x, y = (rotation[i, 1] * edges + pose.translation[i] for i in range(2))
-    ahead = x > _NEAREST
-    return jnp.where(ahead, x, 1.0), jnp.where(ahead, y, 0.0), ahead
+    in_front = x > _NEAREST
+    return jnp.where(in_front, x, 1.0), jnp.where(in_front, y, 0.0), in_front

@@ -11,9 +11,9 @@ from scipy.stats import chi2
 from jaxloc.features.opencv.chessboard import board_points, find_chessboard
 from jaxloc.poses import SE3, retract
 from jaxloc.refinement.calibration import (
+    BrownConradyModel,
     Calibrated,
     Fisheye,
-    Glass,
     Intrinsics,
     NoLens,
     board_errors,
@@ -21,7 +21,7 @@ from jaxloc.refinement.calibration import (
     camera_parameters,
 )
 from jaxloc.refinement.calibration.camera import check_corners, prepare
-from jaxloc.refinement.calibration.zhang import safe_views
+from jaxloc.refinement.calibration.zhang import finite_views
 from jaxloc.sensors import BrownConrady, KannalaBrandt, Pinhole
 from jaxloc.solvers import Huber, Problem, Quadratic
 
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.heavy
 
 SHAPE, NUM = (480, 640), 6
 BOARD = board_points((6, 5), 0.05)
-TWO = Intrinsics(Glass(radial=2))
+TWO = Intrinsics(BrownConradyModel(radial=2))
 TILTS = np.random.default_rng(4).uniform(-0.6, 0.6, (NUM, 3))
 
 
@@ -194,7 +194,7 @@ def test_what_cannot_be_determined(x64, rng):
     with pytest.raises(ValueError, match="29 corners"):
         check_corners(jnp.asarray(BOARD[:29]), corners)
     with pytest.raises(ValueError, match="radial=5"):
-        Glass(5)
+        BrownConradyModel(5)
     with pytest.raises(ValueError, match="radial=9"):
         Fisheye(9)
 
@@ -220,7 +220,7 @@ def test_single_precision_is_near(rng):
 
 def test_derivatives_picture_by_picture_are_those_of_the_whole(x64, rng):
     corners = noisy(rng)[:3].at[1].set(jnp.nan)
-    views = safe_views(jnp.asarray(BOARD), corners, None)
+    views = finite_views(jnp.asarray(BOARD), corners, None)
     _, problem, start = eqx.filter_jit(prepare)(views, TWO, SHAPE, Huber(1.0))
     state = retract(start, 0.01 * jnp.asarray(rng.normal(size=8 + 18)))
     ours = eqx.filter_jit(lambda p, x: p.linearize(x))(problem, state)
