@@ -112,7 +112,8 @@ def test_covariance_of_a_camera_pose_is_consistent(rng):
     """Also: at least 99 % of solvable problems in single precision are reported as solved."""
     nees, ok, steps = normalized_errors(*views(2000, 30, 0.0, rng), {})
     assert np.mean(ok) >= 0.99 and np.max(steps) <= 12
-    low, high = stats.chi2.ppf([0.001, 0.999], 6 * np.sum(ok)) / np.sum(ok)
+    count = int(np.sum(ok))
+    low, high = stats.chi2.ppf([0.001, 0.999], 6 * count) / count
     assert low < np.mean(nees[ok]) < high
 
 
@@ -122,7 +123,7 @@ def test_covariance_under_a_robust_kernel_is_consistent(rng):
     # The covariance is estimated from the scores of 60 items: Hotelling's T^2 with 60 - 6 degrees of freedom.
     dof, spare = 6, 60 - 6
     scale, law = dof * spare / (spare - dof + 1), stats.f(dof, spare - dof + 1)
-    standard_error = scale * law.std() / np.sqrt(np.sum(ok))
+    standard_error = scale * law.std() / np.sqrt(int(np.sum(ok)))
     assert abs(np.mean(nees[ok]) - scale * law.mean()) < 3.3 * standard_error
 
 
