@@ -82,8 +82,8 @@ def simulate(key, scans):
         there = jnp.arange(ROOM - SLOTS) < jax.random.poisson(keys[7], rate)
         return (states, alive), (jnp.concatenate([own, false]), jnp.concatenate([seen, there]))
 
-    nobody = jnp.zeros((SLOTS, 4)), jnp.zeros(SLOTS, bool)
-    return jax.lax.scan(scan, nobody, jax.random.split(key, scans))[1]
+    empty = jnp.zeros((SLOTS, 4)), jnp.zeros(SLOTS, bool)
+    return jax.lax.scan(scan, empty, jax.random.split(key, scans))[1]
 
 
 drives, scans = (4, 8) if FAST else (24, 15)
