@@ -74,7 +74,7 @@ def test_derivatives(rng, x64):
     np.testing.assert_allclose(got, (place(1e-4) - place(-1e-4)) / 2e-4, rtol=1e-3, atol=1e-6)
 
 
-def test_degenerate_pictures(rng):
+def test_degenerate_images(rng):
     previous, current = pair(rng)
     unrelated = jnp.asarray(rng.normal(size=(SIDE, SIDE)), jnp.float32)
     cases = {
@@ -129,6 +129,6 @@ def test_similarity_finds_any_turn(rng):  # R-33, R-34
         assert np.sqrt(np.mean(np.sum(error[:2] ** 2, axis=0))) < 1.0, degrees
 
 
-def test_similarity_of_blank_pictures():
+def test_similarity_of_blank_images():
     found = phase_correlation.similarity(jnp.zeros((128, 128)), jnp.zeros((128, 128)), sampling=SAMPLING)
     assert not bool(found.ok) and all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))

@@ -24,15 +24,15 @@ def scene():
         jnp.asarray(texture, jnp.float32), 0.02, SE3.from_euler(jnp.array([1.0, 2.0, 0.5]), 0.3, 0.1, 0.0)
     )
     pose = plane.T_world_plane @ SE3.exp(jnp.array([1.25, 1.25, -1.4, 0.08, -0.05, 0.1]))
-    picture = plane.predict(CAMERA, pose, shape=SHAPE, method=Bicubic())
-    assert bool(jnp.all(picture.seen))
-    return plane, pose, picture.image
+    photo = plane.predict(CAMERA, pose, shape=SHAPE, method=Bicubic())
+    assert bool(jnp.all(photo.seen))
+    return plane, pose, photo.image
 
 
 def test_pose_is_found_under_another_exposure(scene):
-    plane, truth, picture = scene
+    plane, truth, photo = scene
     rng = np.random.default_rng(1)
-    dark = np.uint8(np.clip(0.6 * np.asarray(picture) + 25 + rng.normal(size=SHAPE), 0, 255))
+    dark = np.uint8(np.clip(0.6 * np.asarray(photo) + 25 + rng.normal(size=SHAPE), 0, 255))
     start = truth @ SE3.exp(jnp.array([0.04, -0.03, 0.06, 0.01, -0.01, 0.03]))
     fit = plane_pose.refine_pose(dark, plane, CAMERA, start)
     error = truth.local(fit.value)
@@ -42,27 +42,27 @@ def test_pose_is_found_under_another_exposure(scene):
 
 
 def test_covariance_is_consistent(scene):
-    plane, truth, picture = scene
+    plane, truth, photo = scene
     rng = np.random.default_rng(2)
-    pictures = jnp.asarray(np.asarray(picture) + 3.0 * rng.normal(size=(40, *SHAPE)), jnp.float32)
+    photos = jnp.asarray(np.asarray(photo) + 3.0 * rng.normal(size=(40, *SHAPE)), jnp.float32)
 
     def squared(noisy):
         fit = plane_pose.refine_pose(noisy, plane, CAMERA, truth, levels=1, stride=1, sigma=3.0)
         return fit.gaussian().mahalanobis_squared(truth), fit.ok
 
-    values, ok = jax.lax.map(squared, pictures)
+    values, ok = jax.lax.map(squared, photos)
     assert bool(jnp.all(ok))
     low, high = chi2.ppf([0.005, 0.995], 6 * 40) / 40
     assert low < float(jnp.mean(values)) < high
 
 
 def test_degenerate_inputs_are_flagged(scene):
-    plane, truth, picture = scene
+    plane, truth, photo = scene
     away = truth @ SE3.exp(jnp.array([0.0, 0.0, 0.0, np.pi, 0.0, 0.0]))
     flat = TexturedPlane(jnp.full((128, 128), 90.0), 0.02, plane.T_world_plane)
     for fit in (
-        plane_pose.refine_pose(picture, plane, CAMERA, away),
-        plane_pose.refine_pose(picture, flat, CAMERA, truth),
+        plane_pose.refine_pose(photo, plane, CAMERA, away),
+        plane_pose.refine_pose(photo, flat, CAMERA, truth),
         plane_pose.refine_pose(jnp.full(SHAPE, jnp.nan), plane, CAMERA, truth),
     ):
         assert not bool(fit.ok)

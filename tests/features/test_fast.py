@@ -10,7 +10,7 @@ from jaxloc.features.fast import CIRCLE, fast, segment_score, strongest_keypoint
 
 
 @pytest.fixture(scope="module")
-def picture():
+def photo():
     rng = np.random.default_rng(0)
     image = cv2.GaussianBlur(rng.uniform(60, 140, (90, 120)), (0, 0), 1.0)
     for _ in range(60):
@@ -25,24 +25,24 @@ def corners(found):
 
 
 @pytest.mark.parametrize("threshold", [5, 20, 60])
-def test_corners_and_scores_equal_opencv(picture, dtype, threshold):  # T-51
+def test_corners_and_scores_equal_opencv(photo, dtype, threshold):  # T-51
     peer = cv2.FastFeatureDetector_create(threshold, True)
-    theirs = {(int(k.pt[0]), int(k.pt[1]), int(k.response) + 1) for k in peer.detect(picture)}
-    found = fast(jnp.asarray(picture, dtype), threshold=threshold, capacity=2000)
+    theirs = {(int(k.pt[0]), int(k.pt[1]), int(k.response) + 1) for k in peer.detect(photo)}
+    found = fast(jnp.asarray(photo, dtype), threshold=threshold, capacity=2000)
     assert found.uv.dtype == dtype and len(theirs) > 20
     assert corners(found) == theirs
 
 
-def test_without_thinning_equal_opencv(picture):
+def test_without_thinning_equal_opencv(photo):
     peer = cv2.FastFeatureDetector_create(20, False)
-    theirs = {(int(k.pt[0]), int(k.pt[1])) for k in peer.detect(picture)}
-    rows, columns = np.nonzero(np.asarray(segment_score(jnp.asarray(picture, jnp.float32))) > 20)
+    theirs = {(int(k.pt[0]), int(k.pt[1])) for k in peer.detect(photo)}
+    rows, columns = np.nonzero(np.asarray(segment_score(jnp.asarray(photo, jnp.float32))) > 20)
     assert set(zip(columns.tolist(), rows.tolist(), strict=True)) == theirs
 
 
 @pytest.mark.parametrize("arc", [9, 10, 12, 16])
-def test_score_equals_a_loop(picture, arc):  # T-51: FAST-9 to FAST-12
-    image = picture[:24, :30].astype(float)
+def test_score_equals_a_loop(photo, arc):  # T-51: FAST-9 to FAST-12
+    image = photo[:24, :30].astype(float)
     ours = segment_score(jnp.asarray(image, jnp.float32), arc=arc)
     plain = np.zeros(image.shape)
     for v in range(3, 21):
@@ -53,21 +53,21 @@ def test_score_equals_a_loop(picture, arc):  # T-51: FAST-9 to FAST-12
     np.testing.assert_allclose(ours, plain)
 
 
-def test_longer_arcs_find_fewer_corners(picture):
-    counts = [int((segment_score(jnp.asarray(picture, jnp.float32), arc=arc) > 10).sum()) for arc in (9, 10, 12)]
+def test_longer_arcs_find_fewer_corners(photo):
+    counts = [int((segment_score(jnp.asarray(photo, jnp.float32), arc=arc) > 10).sum()) for arc in (9, 10, 12)]
     assert counts == sorted(counts, reverse=True) and counts[0] > 1.2 * counts[2] > 0
 
 
-def test_strongest_come_first_and_slots_are_safe(picture):
-    image = jnp.asarray(picture, jnp.float32)
+def test_strongest_come_first_and_slots_are_safe(photo):
+    image = jnp.asarray(photo, jnp.float32)
     few, many = fast(image, threshold=20.0, capacity=10), fast(image, threshold=20.0, capacity=2000)
     assert corners(few) <= corners(many) and float(few.response.min()) >= float(many.response[10])
     assert not np.asarray(many.uv)[~np.asarray(many.valid)].any() and not many.angle.any()
     assert strongest_keypoints(jnp.zeros((4, 5)), 30).valid.shape == (30,)
 
 
-def test_score_does_not_depend_on_bias_and_turns(picture):
-    image = picture[:90, :90].astype(np.float32)
+def test_score_does_not_depend_on_bias_and_turns(photo):
+    image = photo[:90, :90].astype(np.float32)
     score = segment_score(jnp.asarray(image))
     np.testing.assert_allclose(segment_score(jnp.asarray(image + 40)), score)
     np.testing.assert_allclose(segment_score(jnp.asarray(np.rot90(image).copy())), np.rot90(score))
@@ -94,8 +94,8 @@ def test_wrong_arcs_are_refused():
         segment_score(jnp.zeros((20, 20)), arc=17)
 
 
-def test_batch_is_a_loop(picture):
-    images = jnp.asarray(np.stack([picture[:40, :40], picture[40:80, 40:80]]), jnp.float32)
+def test_batch_is_a_loop(photo):
+    images = jnp.asarray(np.stack([photo[:40, :40], photo[40:80, 40:80]]), jnp.float32)
     together = jax.vmap(lambda x: fast(x, capacity=20))(images)
     for i in range(2):
         assert together.uv[i].tolist() == fast(images[i], capacity=20).uv.tolist()

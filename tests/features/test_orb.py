@@ -16,20 +16,20 @@ find = jax.jit(lambda image: orb(image, options=OPTIONS, capacity=400))
 
 
 @pytest.fixture(scope="module")
-def picture():
+def photo():
     folder = Path(pytest.importorskip("skimage.data").__file__).parent
     return cv2.imread(str(folder / "astronaut.png"), cv2.IMREAD_GRAYSCALE)[:240, 100:340]
 
 
 @pytest.fixture(scope="module")
-def found(picture):
-    return find(jnp.asarray(picture, jnp.float32))
+def found(photo):
+    return find(jnp.asarray(photo, jnp.float32))
 
 
-def test_one_level_equals_opencv(picture):
+def test_one_level_equals_opencv(photo):
     """The same corners at whole pixels, with the same directions."""
-    theirs = cv2.ORB_create(100, nlevels=1, edgeThreshold=16, fastThreshold=20).detect(picture)
-    ours, _ = orb(jnp.asarray(picture, jnp.float32), options=Orb(levels=1), capacity=100)
+    theirs = cv2.ORB_create(100, nlevels=1, edgeThreshold=16, fastThreshold=20).detect(photo)
+    ours, _ = orb(jnp.asarray(photo, jnp.float32), options=Orb(levels=1), capacity=100)
     places = {tuple(np.rint(k.pt).astype(int).tolist()): k.angle for k in theirs}
     turned = []
     for uv, angle, ok in zip(ours.uv.tolist(), np.rad2deg(ours.angle), ours.valid.tolist(), strict=True):
@@ -39,9 +39,9 @@ def test_one_level_equals_opencv(picture):
 
 
 @pytest.mark.parametrize(("degrees", "scale"), [(40, 1.0), (0, 0.7)])
-def test_matches_survive_turning_and_scaling(picture, found, degrees, scale):
+def test_matches_survive_turning_and_scaling(photo, found, degrees, scale):
     matrix = cv2.getRotationMatrix2D((119.5, 119.5), degrees, scale)
-    image = cv2.warpAffine(picture, matrix, (240, 240), flags=cv2.INTER_LINEAR)
+    image = cv2.warpAffine(photo, matrix, (240, 240), flags=cv2.INTER_LINEAR)
     other = find(jnp.asarray(image, jnp.float32))
     pairs = match(found[1], other[1], ratio=0.8)
     valid = np.asarray(pairs.valid)
@@ -62,13 +62,13 @@ def test_records_are_padded_and_bits_packed(found):
 
 
 @pytest.mark.parametrize("value", [0.0, 120.0, np.nan])
-def test_blank_pictures(value):
+def test_blank_images(value):
     keypoints, descriptors = find(jnp.full((240, 240), value, jnp.float32))
     assert not keypoints.valid.any() and not descriptors.values.any() and np.isfinite(keypoints.uv).all()
 
 
-def test_batch_is_a_loop(picture):
-    images = jnp.asarray(np.stack([picture[:100, :100], picture[100:200, 100:200]]), jnp.float32)
+def test_batch_is_a_loop(photo):
+    images = jnp.asarray(np.stack([photo[:100, :100], photo[100:200, 100:200]]), jnp.float32)
     run = lambda image: orb(image, options=Orb(levels=1), capacity=30)  # noqa: E731
     together = jax.jit(jax.vmap(run))(images)
     for i in range(2):

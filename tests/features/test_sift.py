@@ -16,14 +16,14 @@ find = jax.jit(lambda image: sift(image, capacity=1500))
 
 
 @pytest.fixture(scope="module")
-def picture():
+def photo():
     folder = Path(pytest.importorskip("skimage.data").__file__).parent
     return cv2.imread(str(folder / "astronaut.png"), cv2.IMREAD_GRAYSCALE)[:384, :384]
 
 
 @pytest.fixture(scope="module")
-def found(picture):
-    return find(jnp.asarray(picture, jnp.float32))
+def found(photo):
+    return find(jnp.asarray(photo, jnp.float32))
 
 
 def kept(found):
@@ -34,9 +34,9 @@ def kept(found):
     )[valid]
 
 
-def test_equal_opencv(picture, found):  # R-27, R-28, R-31, T-33...T-35
+def test_equal_opencv(photo, found):  # R-27, R-28, R-31, T-33...T-35
     peer = cv2.SIFT_create(0, 3, 0.04, 10, 1.6, cv2.CV_32F, True)
-    theirs, words = peer.detectAndCompute(picture, None)
+    theirs, words = peer.detectAndCompute(photo, None)
     uv, size, angle, values = kept(found)
     tree, angles, cosines, sizes, near = cKDTree(uv), [], [], [], 0
     for keypoint, word in zip(theirs, words, strict=True):
@@ -65,10 +65,10 @@ def test_a_blob_has_its_own_size(x64):
         assert 0.5 * size[0] == pytest.approx(sigma / 2 ** (1 / 6), rel=0.03)
 
 
-def test_keypoints_turn_with_the_picture(picture, found):
+def test_keypoints_turn_with_the_image(photo, found):
     """By a quarter, which no interpolation disturbs (but the doubled image's last row)."""
     uv, _, angle, values = kept(found)
-    turned = kept(find(jnp.asarray(np.ascontiguousarray(np.rot90(picture, -1)), jnp.float32)))
+    turned = kept(find(jnp.asarray(np.ascontiguousarray(np.rot90(photo, -1)), jnp.float32)))
     expected = np.stack([383 - uv[:, 1], uv[:, 0]], axis=1)
     distance, index = cKDTree(turned[0]).query(expected, k=3)
     best = np.argmin(np.abs((turned[2][index] - angle[:, None] - np.pi / 2 + np.pi) % (2 * np.pi) - np.pi), axis=1)
@@ -77,16 +77,16 @@ def test_keypoints_turn_with_the_picture(picture, found):
     assert np.mean((distance[:, 0] < 0.2) & (cosine > 0.98)) > 0.9
 
 
-def test_descriptors_know_no_gain_and_bias(picture):
+def test_descriptors_know_no_gain_and_bias(photo):
     points = Keypoints.from_uv(jnp.array([[100.0, 120.0], [200.5, 80.2], [2.0, 2.0]]), size=10.0)
-    image = jnp.asarray(picture, jnp.float32)
+    image = jnp.asarray(photo, jnp.float32)
     plain, darker = describe_sift(image, points), describe_sift(0.4 * image + 30.0, points)
     np.testing.assert_allclose(plain.values, darker.values, atol=1e-4)
     np.testing.assert_allclose(jnp.linalg.norm(plain.values, axis=1), 1.0, atol=1e-5)
 
 
-def test_gradients_equal_differences(x64, picture):
-    image = jnp.asarray(cv2.GaussianBlur(picture, (0, 0), 1.0)[60:124, 190:254], jnp.float64)
+def test_gradients_equal_differences(x64, photo):
+    image = jnp.asarray(cv2.GaussianBlur(photo, (0, 0), 1.0)[60:124, 190:254], jnp.float64)
     change = jnp.asarray(np.random.default_rng(0).normal(size=image.shape))
 
     @jax.jit
@@ -103,7 +103,7 @@ def test_gradients_equal_differences(x64, picture):
 
 
 @pytest.mark.parametrize("value", [0.0, 120.0, np.nan])
-def test_blank_pictures(value):
+def test_blank_images(value):
     def total(image):
         keypoints, descriptors = sift(image, capacity=8)
         return jnp.sum(keypoints.uv) + jnp.sum(descriptors.values), keypoints.valid
@@ -112,8 +112,8 @@ def test_blank_pictures(value):
     assert not valid.any() and np.isfinite(slope).all()
 
 
-def test_batch_is_a_loop(picture):
-    images = jnp.asarray(np.stack([picture[:96, :96], picture[96:192, 96:192]]), jnp.float32)
+def test_batch_is_a_loop(photo):
+    images = jnp.asarray(np.stack([photo[:96, :96], photo[96:192, 96:192]]), jnp.float32)
     run = lambda image: sift(image, capacity=20)[0].uv  # noqa: E731
     together = jax.jit(jax.vmap(run))(images)
     for i in range(2):

@@ -18,19 +18,19 @@ find = jax.jit(lambda image: surf(image, capacity=400))
 
 
 @pytest.fixture(scope="module")
-def picture():
+def photo():
     folder = Path(pytest.importorskip("skimage.data").__file__).parent
     return cv2.imread(str(folder / "astronaut.png"), cv2.IMREAD_GRAYSCALE)[:257, 100:357]
 
 
 @pytest.fixture(scope="module")
-def found(picture):
-    return find(jnp.asarray(picture, jnp.float32))
+def found(photo):
+    return find(jnp.asarray(photo, jnp.float32))
 
 
-def warped(picture, degrees, scale):
+def warped(photo, degrees, scale):
     matrix = cv2.getRotationMatrix2D((128.0, 128.0), degrees, scale)
-    return cv2.warpAffine(picture, matrix, (257, 257), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), matrix
+    return cv2.warpAffine(photo, matrix, (257, 257), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), matrix
 
 
 def kept(found):
@@ -49,11 +49,11 @@ def haar(image, u, v, half):
     )
 
 
-def test_descriptor_equals_a_plain_sum(picture):  # T-39
+def test_descriptor_equals_a_plain_sum(photo):  # T-39
     """Upright at scale two, with all samples at corners of pixels."""
-    image, center, values = picture.astype(float), 119.5, []
+    image, center, values = photo.astype(float), 119.5, []
     points = Keypoints.from_uv(jnp.array([[center, center]]), size=15.0)
-    ours = describe_surf(jnp.asarray(picture, jnp.float32), points)
+    ours = describe_surf(jnp.asarray(photo, jnp.float32), points)
     for row in range(4):
         for column in range(4):
             total = np.zeros(4)
@@ -78,11 +78,11 @@ def test_blobs_have_their_size_and_sign(x64):
         assert size[0] / 6 == pytest.approx(sigma, rel=0.12) and signs[0] == sign
 
 
-def test_keypoints_turn_with_the_picture(picture, found):
+def test_keypoints_turn_with_the_image(photo, found):
     """By a quarter, which nothing disturbs."""
     uv, size, angle, sign, values = kept(found)
     assert len(uv) > 200
-    turned = kept(find(jnp.asarray(np.ascontiguousarray(np.rot90(picture, -1)), jnp.float32)))
+    turned = kept(find(jnp.asarray(np.ascontiguousarray(np.rot90(photo, -1)), jnp.float32)))
     distance, index = cKDTree(turned[0]).query(np.stack([256 - uv[:, 1], uv[:, 0]], axis=1))
     apart = np.abs((turned[2][index] - angle - np.pi / 2 + np.pi) % (2 * np.pi) - np.pi)
     same = (distance < 0.05) & (apart < 0.02) & (np.sum(values * turned[4][index], axis=1) > 0.99)
@@ -91,8 +91,8 @@ def test_keypoints_turn_with_the_picture(picture, found):
 
 
 @pytest.mark.parametrize(("degrees", "scale", "least"), [(30, 1.0, 0.75), (0, 0.7, 0.75), (45, 1.4, 0.6)])
-def test_matches_survive_turning_and_scaling(picture, found, degrees, scale, least):
-    image, matrix = warped(picture, degrees, scale)
+def test_matches_survive_turning_and_scaling(photo, found, degrees, scale, least):
+    image, matrix = warped(photo, degrees, scale)
     other = find(jnp.asarray(image, jnp.float32))
     pairs = match(found[1], other[1], ratio=0.8)
     valid = np.asarray(pairs.valid)
@@ -101,8 +101,8 @@ def test_matches_survive_turning_and_scaling(picture, found, degrees, scale, lea
     assert valid.sum() > 30 and np.mean(error < 3.0) > least
 
 
-def test_the_sign_gate_halves_the_candidates_and_loses_no_match(picture, found):  # T-40
-    image, matrix = warped(picture, 20, 0.9)
+def test_the_sign_gate_halves_the_candidates_and_loses_no_match(photo, found):  # T-40
+    image, matrix = warped(photo, 20, 0.9)
     other = find(jnp.asarray(image, jnp.float32))
     gate = laplacian_gate(found[0], other[0])
     pairs = found[0].valid[:, None] & other[0].valid[None, :]
@@ -117,16 +117,16 @@ def test_the_sign_gate_halves_the_candidates_and_loses_no_match(picture, found):
     assert len(plain) > 100 and plain <= gated
 
 
-def test_descriptors_know_no_gain_and_bias(picture):
+def test_descriptors_know_no_gain_and_bias(photo):
     points = Keypoints.from_uv(jnp.array([[100.0, 120.0], [130.5, 80.2], [2.0, 2.0]]), size=15.0)
-    image = jnp.asarray(picture, jnp.float32)
+    image = jnp.asarray(photo, jnp.float32)
     plain, darker = describe_surf(image, points), describe_surf(0.5 * image + 30.0, points)
     np.testing.assert_allclose(plain.values, darker.values, atol=1e-4)
     np.testing.assert_allclose(jnp.linalg.norm(plain.values, axis=1), 1.0, atol=1e-5)
 
 
-def test_gradients_equal_differences(x64, picture):
-    image = jnp.asarray(cv2.GaussianBlur(picture, (0, 0), 1.0)[60:124, 90:154], jnp.float64)
+def test_gradients_equal_differences(x64, photo):
+    image = jnp.asarray(cv2.GaussianBlur(photo, (0, 0), 1.0)[60:124, 90:154], jnp.float64)
     change = jnp.asarray(np.random.default_rng(0).normal(size=image.shape))
 
     @jax.jit
@@ -141,7 +141,7 @@ def test_gradients_equal_differences(x64, picture):
 
 
 @pytest.mark.parametrize("value", [0.0, 120.0, np.nan])
-def test_blank_pictures(value):
+def test_blank_images(value):
     def total(image):
         keypoints, descriptors = surf(image, options=ONE, capacity=6)
         return jnp.sum(keypoints.uv) + jnp.sum(descriptors.values), keypoints
@@ -150,8 +150,8 @@ def test_blank_pictures(value):
     assert not keypoints.valid.any() and not keypoints.layer.any() and np.isfinite(slope).all()
 
 
-def test_batch_is_a_loop(picture):
-    images = jnp.asarray(np.stack([picture[:64, :64], picture[64:128, 64:128]]), jnp.float32)
+def test_batch_is_a_loop(photo):
+    images = jnp.asarray(np.stack([photo[:64, :64], photo[64:128, 64:128]]), jnp.float32)
     run = jax.jit(lambda image: surf(image, options=ONE, capacity=6))
     together = jax.jit(jax.vmap(lambda image: surf(image, options=ONE, capacity=6)))(images)
     for i in range(2):

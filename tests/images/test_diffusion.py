@@ -130,7 +130,7 @@ def test_gradients_equal_differences(x64, rng):
 
 
 @pytest.mark.parametrize("value", [0.0, 120.0, np.nan])
-def test_blank_pictures(value):
+def test_blank_images(value):
     slope = jax.grad(lambda image: jnp.sum(diffuse(image, sigma=2.0) ** 2))(jnp.full((16, 20), value, jnp.float32))
     assert np.isfinite(slope).all()
     assert float(contrast(jnp.full((16, 20), value, jnp.float32))) == 1.0

@@ -11,24 +11,24 @@ from jaxloc.images.normalization import as_gray, fit_gain_bias, rank_transform, 
 
 
 @pytest.fixture
-def picture(rng):
+def photo(rng):
     return rng.uniform(0, 200, (12, 17))
 
 
-def test_standardize_is_a_z_score(picture, dtype):
-    image = jnp.asarray(picture, dtype)
+def test_standardize_is_a_z_score(photo, dtype):
+    image = jnp.asarray(photo, dtype)
     result = standardize(image)
     assert result.dtype == dtype
-    np.testing.assert_allclose(result, (picture - picture.mean()) / picture.std(), atol=1e-4)
+    np.testing.assert_allclose(result, (photo - photo.mean()) / photo.std(), atol=1e-4)
     np.testing.assert_allclose(standardize(0.6 * image + 30), result, atol=1e-4)
 
 
-def test_what_is_not_valid_does_not_count(picture):
-    image = jnp.asarray(picture, jnp.float32).at[2, 3].set(jnp.nan)
+def test_what_is_not_valid_does_not_count(photo):
+    image = jnp.asarray(photo, jnp.float32).at[2, 3].set(jnp.nan)
     valid = jnp.ones(image.shape, bool).at[0].set(False)
     kept = np.asarray(valid) & np.isfinite(np.asarray(image))
     result = standardize(image, valid=valid)
-    np.testing.assert_allclose(result[kept], (picture[kept] - picture[kept].mean()) / picture[kept].std(), atol=1e-4)
+    np.testing.assert_allclose(result[kept], (photo[kept] - photo[kept].mean()) / photo[kept].std(), atol=1e-4)
     assert np.all(np.asarray(result)[~kept] == 0)
     gradient = jax.grad(lambda x: jnp.sum(standardize(x, valid=valid) ** 3))(image)
     assert np.all(np.isfinite(gradient))
@@ -42,26 +42,26 @@ def test_flat_images_stay_finite():
     assert not fit.ok and float(fit.gain) == 1.0
 
 
-def test_gain_and_bias_equal_a_line_fit(picture, rng):
-    image = 0.7 * picture + 12 + rng.normal(size=picture.shape)
-    slope, offset = np.polyfit(picture.ravel(), image.ravel(), 1)
-    fit = fit_gain_bias(jnp.asarray(image, jnp.float32), jnp.asarray(picture, jnp.float32))
+def test_gain_and_bias_equal_a_line_fit(photo, rng):
+    image = 0.7 * photo + 12 + rng.normal(size=photo.shape)
+    slope, offset = np.polyfit(photo.ravel(), image.ravel(), 1)
+    fit = fit_gain_bias(jnp.asarray(image, jnp.float32), jnp.asarray(photo, jnp.float32))
     np.testing.assert_allclose([fit.gain, fit.bias], [slope, offset], rtol=1e-3)
     assert bool(fit.ok)
 
 
-def test_local_standardization_equals_filters(picture):
-    mean = uniform_filter(picture, 5, mode="mirror")
-    variance = uniform_filter(picture**2, 5, mode="mirror") - mean**2
-    result = standardize_locally(jnp.asarray(picture, jnp.float32), radius=2)
-    np.testing.assert_allclose(result, (picture - mean) / np.sqrt(variance + 1), atol=1e-3)
+def test_local_standardization_equals_filters(photo):
+    mean = uniform_filter(photo, 5, mode="mirror")
+    variance = uniform_filter(photo**2, 5, mode="mirror") - mean**2
+    result = standardize_locally(jnp.asarray(photo, jnp.float32), radius=2)
+    np.testing.assert_allclose(result, (photo - mean) / np.sqrt(variance + 1), atol=1e-3)
 
 
-def test_rank_counts_darker_neighbors(picture):
-    result = np.asarray(rank_transform(jnp.asarray(picture, jnp.float32), radius=2))
-    window = picture[3:8, 4:9]
+def test_rank_counts_darker_neighbors(photo):
+    result = np.asarray(rank_transform(jnp.asarray(photo, jnp.float32), radius=2))
+    window = photo[3:8, 4:9]
     assert result[5, 6] == pytest.approx((rankdata(window)[12] - 1) / 24)
-    darker = rank_transform(jnp.asarray((picture / 255) ** 2.2, jnp.float32), radius=2)
+    darker = rank_transform(jnp.asarray((photo / 255) ** 2.2, jnp.float32), radius=2)
     np.testing.assert_array_equal(darker, result)
 
 

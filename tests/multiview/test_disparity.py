@@ -111,7 +111,7 @@ def test_what_only_one_picture_shows_is_not_valid():
 
 
 @pytest.mark.parametrize("kind", ["flat", "nan", "unrelated"])
-def test_bad_pictures(dtype, kind):
+def test_bad_images(dtype, kind):
     left, right = scene(4.0)
     if kind == "flat":
         left[:], right[:] = 100.0, 100.0

@@ -97,7 +97,7 @@ def test_undetermined_sets(dtype, rng, kind):
     assert all(np.all(slope == 0) for slope in slopes)
 
 
-def test_too_few_pairs_are_told():
+def test_too_few_pairs_raise_an_error():
     with pytest.raises(ValueError, match="needs 8"):
         eight_point(jnp.zeros((7, 2)), jnp.zeros((7, 2)))
 

@@ -169,16 +169,16 @@ def test_graffiti(recordings):
     folder = recordings / "homography_graf"
     stored = cv2.FileStorage(str(folder / "H1to3p.xml"), cv2.FILE_STORAGE_READ)
     truth = stored.getFirstTopLevelNode().mat()
-    pictures = [cv2.imread(str(folder / f"graf{i}.png"), cv2.IMREAD_GRAYSCALE) for i in (1, 3)]
+    photos = [cv2.imread(str(folder / f"graf{i}.png"), cv2.IMREAD_GRAYSCALE) for i in (1, 3)]
     sift = cv2.SIFT_create(2000)
-    (keys1, words1), (keys2, words2) = (sift.detectAndCompute(picture, None) for picture in pictures)
+    (keys1, words1), (keys2, words2) = (sift.detectAndCompute(image, None) for image in photos)
     matches = [m for m, n in cv2.BFMatcher().knnMatch(words1, words2, k=2) if m.distance < 0.85 * n.distance]
     first = np.array([keys1[m.queryIdx].pt for m in matches])
     second = np.array([keys2[m.trainIdx].pt for m in matches])
     fit = estimate_homography(
         jnp.asarray(first), jnp.asarray(second), key=jax.random.key(0), sigma=1.0, hypotheses=1024
     )
-    rows, columns = pictures[0].shape
+    rows, columns = photos[0].shape
     corners = np.array([[0.2, 0.2], [0.8, 0.2], [0.8, 0.8], [0.2, 0.8]]) * [columns, rows]
     assert bool(fit.ok)
     # Some pixels: the wall is not quite flat, and the published homography was fitted to points as well.

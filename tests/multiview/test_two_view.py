@@ -147,7 +147,7 @@ def test_degenerate_sets(kind):
     assert np.all(np.asarray(slopes[0])[refused] == 0)
 
 
-def test_too_few_are_told():
+def test_too_few_raise_an_error():
     with pytest.raises(ValueError, match="needs 5"):
         estimate_relative_pose(jnp.zeros((4, 2)), jnp.zeros((4, 2)), sigma=1e-3, key=jax.random.key(0))
 

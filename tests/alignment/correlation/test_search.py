@@ -202,7 +202,7 @@ def broken(rng):
 
 
 @pytest.mark.parametrize("score", SCORES)
-def test_degenerate_pictures(rng, score):
+def test_degenerate_images(rng, score):
     gradient = eqx.filter_jit(
         jax.value_and_grad(lambda image, template: _sum(search(image, template, score=score)), (0, 1), has_aux=True)
     )

@@ -60,10 +60,10 @@ def test_points_are_found(rng, dtype):  # K-27
 
 def test_opencv_agrees(rng):
     inputs, _ = case(rng)
-    pictures = [np.asarray(x).clip(0, 255).round().astype(np.uint8) for x in inputs[:2]]
+    images = [np.asarray(x).clip(0, 255).round().astype(np.uint8) for x in inputs[:2]]
     uv = np.asarray(inputs[2])
-    peer, status, _ = cv2.calcOpticalFlowPyrLK(*pictures, uv[:, None], None, winSize=(21, 21), maxLevel=3)
-    found = track(*(jnp.asarray(x) for x in pictures), inputs[2])
+    peer, status, _ = cv2.calcOpticalFlowPyrLK(*images, uv[:, None], None, winSize=(21, 21), maxLevel=3)
+    found = track(*(jnp.asarray(x) for x in images), inputs[2])
     both = np.asarray(found.ok) & (status[:, 0] > 0)
     apart = np.linalg.norm(np.asarray(found.points) - peer[:, 0], axis=1)[both]
     assert both.mean() > 0.9 and np.median(apart) < 0.03 and np.quantile(apart, 0.95) < 0.2

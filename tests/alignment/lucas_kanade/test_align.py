@@ -27,8 +27,8 @@ def texture(rng, shape=(96, 104), smoothness=2.5):
     """A smooth random image."""
     v, u = np.meshgrid(np.fft.fftfreq(shape[0]), np.fft.fftfreq(shape[1]), indexing="ij")
     spectrum = np.fft.fft2(rng.normal(size=shape)) * np.exp(-2 * (np.pi * smoothness) ** 2 * (u**2 + v**2))
-    picture = np.fft.ifft2(spectrum).real
-    return 120 + 45 * picture / picture.std()
+    photo = np.fft.ifft2(spectrum).real
+    return 120 + 45 * photo / photo.std()
 
 
 def truth(group):
@@ -113,14 +113,14 @@ def test_descents_reach_the_warp(descent, bound, formulation):
 def test_newton_has_the_exact_hessian(formulation, x64):
     """Second-order terms against the Hessian of the cost on an image that is known between its pixels."""
 
-    def picture(u, v, wave):
+    def photo(u, v, wave):
         return 120 + 40 * wave(0.11 * u + 0.03 * v + 0.3) * wave(0.09 * v - 0.02 * u + 1.2) + 10 * wave(0.15 * v)
 
     u, v = np.meshgrid(np.arange(104.0), np.arange(96.0))
     matrix = truth(Homography)
     places = matrix @ np.stack([u[:SIZE, :SIZE].ravel(), v[:SIZE, :SIZE].ravel(), np.ones(SIZE**2)])
-    template = picture(places[0] / places[2], places[1] / places[2], np.sin).reshape(SIZE, SIZE)
-    image, weights = jnp.asarray(picture(u, v, np.sin)), jnp.ones((SIZE, SIZE))
+    template = photo(places[0] / places[2], places[1] / places[2], np.sin).reshape(SIZE, SIZE)
+    image, weights = jnp.asarray(photo(u, v, np.sin)), jnp.ones((SIZE, SIZE))
     method = lk.LucasKanade(
         formulation=formulation, brightness=lk.Unchanged(), scales=lk.FullSize(), interpolation=jl.images.Bicubic()
     )
@@ -131,7 +131,7 @@ def test_newton_has_the_exact_hessian(formulation, x64):
 
     def cost(delta):
         right, down = level.pixels(formulation.update(at, delta))
-        return 0.5 * jnp.sum(level.weight * (picture(right, down, jnp.sin) - level.template) ** 2)
+        return 0.5 * jnp.sum(level.weight * (photo(right, down, jnp.sin) - level.template) ** 2)
 
     exact = jax.hessian(cost)(jnp.zeros(8))
     scale = np.sqrt(np.abs(np.outer(np.diag(exact), np.diag(exact))))
@@ -222,8 +222,8 @@ def test_covariance_is_consistent(clean, pair):
     templates = jnp.asarray(template + (0 if clean else 5) * rng.normal(size=(200, SIZE, SIZE)), jnp.float32)
     known = jnp.asarray(affine, jnp.float32)
 
-    def nees(pictures):
-        fit = lk.align(pictures[0], pictures[1], Affine, start(), method=method)
+    def nees(photos):
+        fit = lk.align(photos[0], photos[1], Affine, start(), method=method)
         return fit.gaussian().mahalanobis_squared(Affine.from_matrix(known)), fit.ok
 
     values, ok = jax.lax.map(jax.jit(nees), (images, templates), batch_size=20)
@@ -295,7 +295,7 @@ def differentiated(image, template, place, loss):
 
 @pytest.mark.parametrize("kind", ["flat", "edge", "outside", "nan", "start", "noise"])
 @pytest.mark.parametrize("loss", [jl.solvers.Quadratic(), Huber(1.345)], ids=["plain", "robust"])
-def test_bad_numbers_are_flagged(kind, loss, pair):
+def test_non_finite_values_are_flagged(kind, loss, pair):
     image, template, place = (jnp.asarray(x, jnp.float32) for x in bad(kind, np.float32(pair[0]), np.float32(pair[1])))
     fit, slopes = differentiated(image, template, place, loss)
     assert not bool(fit.ok)
@@ -309,8 +309,8 @@ def test_single_bad_pixels_do_no_harm():
     image = texture(np.random.default_rng(7))
     template = cut(image, matrix)
     image[40, 50], template[11, 12] = np.nan, np.inf
-    pictures = jnp.asarray(image, jnp.float32), jnp.asarray(template, jnp.float32)
-    fit, slopes = differentiated(*pictures, jnp.asarray(PLACE, jnp.float32), jl.solvers.Quadratic())
+    photos = jnp.asarray(image, jnp.float32), jnp.asarray(template, jnp.float32)
+    fit, slopes = differentiated(*photos, jnp.asarray(PLACE, jnp.float32), jl.solvers.Quadratic())
     assert bool(fit.ok) and corner_error(fit, matrix) < 0.05
     assert all(np.all(np.isfinite(slope)) for slope in slopes)
 

@@ -141,7 +141,7 @@ def test_gradient_of_the_warp(rng, x64):
     np.testing.assert_allclose(jax.jacfwd(place)(0.0), want, rtol=0.02, atol=1e-5)
 
 
-def test_degenerate_pictures(rng):
+def test_degenerate_images(rng):
     scene = real_scene("astronaut")[:80, :90].astype(np.float32)
     template = scene[12:52, 20:64].copy()
     dotted = template.copy()

@@ -24,17 +24,17 @@ def kernels(size):
 
 
 @pytest.fixture(scope="module")
-def picture():
+def photo():
     return ndimage.gaussian_filter(np.random.default_rng(0).uniform(0, 2000, (80, 97)), 2.0)
 
 
 @pytest.mark.parametrize("octave", [0, 1])
-def test_equal_plain_kernels(picture, dtype, octave):  # T-37
-    found, step = box_hessian(jnp.asarray(picture, dtype), octave=octave), 2**octave
+def test_equal_plain_kernels(photo, dtype, octave):  # T-37
+    found, step = box_hessian(jnp.asarray(photo, dtype), octave=octave), 2**octave
     assert found.determinant.dtype == dtype and found.step == step
     for layer, size in enumerate(filter_sizes(octave)):
         uu, uv = kernels(size)
-        duu, dvv, duv = (ndimage.correlate(picture, k, mode="nearest")[::step, ::step] for k in (uu, uu.T, uv))
+        duu, dvv, duv = (ndimage.correlate(photo, k, mode="nearest")[::step, ::step] for k in (uu, uu.T, uv))
         for ours, theirs in (
             (found.determinant[layer], duu * dvv - (0.9 * duv) ** 2),
             (found.trace[layer], duu + dvv),
@@ -42,11 +42,11 @@ def test_equal_plain_kernels(picture, dtype, octave):  # T-37
             np.testing.assert_allclose(ours, theirs, atol=2e-4 * np.abs(theirs).max())
 
 
-def test_equal_scikit_image(picture, x64):
-    ours = box_hessian(jnp.asarray(picture)).determinant
+def test_equal_scikit_image(photo, x64):
+    ours = box_hessian(jnp.asarray(photo)).determinant
     for layer, size in enumerate((9, 15, 21, 27)):
         # Its squares lie one pixel to the upper left.
-        theirs = np.roll(hessian_matrix_det(picture, size / 3), (1, 1), (0, 1))
+        theirs = np.roll(hessian_matrix_det(photo, size / 3), (1, 1), (0, 1))
         inside = (slice(20, -20), slice(20, -20))
         np.testing.assert_allclose(ours[layer][inside], theirs[inside], atol=1e-6 * np.abs(theirs).max())
 
@@ -68,13 +68,13 @@ def test_weight_makes_up_for_the_boxes():
 
 
 @pytest.mark.parametrize(("layer", "least"), [(0, 0.99), (1, 0.97), (2, 0.93)])
-def test_near_the_true_determinant(picture, x64, layer, least):  # T-37
+def test_near_the_true_determinant(photo, x64, layer, least):  # T-37
     """Boxes a third of the side wide, as far apart, blur by a sixth of the side: more than the paper says."""
     size = filter_sizes(0)[layer]
-    ours = np.asarray(box_hessian(jnp.asarray(picture)).determinant[layer])
+    ours = np.asarray(box_hessian(jnp.asarray(photo)).determinant[layer])
 
     def likeness(sigma):
-        uu, vv, uv = (ndimage.gaussian_filter(picture, sigma, order=order) for order in ((0, 2), (2, 0), (1, 1)))
+        uu, vv, uv = (ndimage.gaussian_filter(photo, sigma, order=order) for order in ((0, 2), (2, 0), (1, 1)))
         truth, found = (x[20:-20, 20:-20].ravel() for x in (uu * vv - uv**2, ours))
         return np.corrcoef(truth, found)[0, 1]
 
@@ -82,7 +82,7 @@ def test_near_the_true_determinant(picture, x64, layer, least):  # T-37
     assert likeness(float(filter_scale(jnp.asarray([float(size)]))[0])) < likeness(size / 6)
 
 
-def test_derivatives_equal_differences(picture, x64):
-    image, change = jnp.asarray(picture[:50, :50]), jnp.asarray(np.random.default_rng(1).normal(size=(50, 50)))
+def test_derivatives_equal_differences(photo, x64):
+    image, change = jnp.asarray(photo[:50, :50]), jnp.asarray(np.random.default_rng(1).normal(size=(50, 50)))
     run = jax.jit(lambda t: box_hessian(image + t * change).determinant)
     np.testing.assert_allclose(jax.jvp(run, (0.0,), (1.0,))[1], (run(1e-4) - run(-1e-4)) / 2e-4, rtol=1e-6, atol=1e-5)

@@ -50,13 +50,13 @@ def poses(tilts=TILTS):
     return jax.vmap(place)(jnp.asarray(centers), jnp.asarray(tilts))
 
 
-def pictures(camera=None, tilts=TILTS):
+def photos(camera=None, tilts=TILTS):
     camera = truth() if camera is None else camera
     return jax.vmap(lambda pose: camera.project(pose.apply(jnp.asarray(BOARD))))(poses(tilts))
 
 
 def noisy(rng, sigma=0.2):
-    return pictures() + sigma * jnp.asarray(rng.normal(size=(NUM, len(BOARD), 2)))
+    return photos() + sigma * jnp.asarray(rng.normal(size=(NUM, len(BOARD), 2)))
 
 
 def numbers(camera):
@@ -81,7 +81,7 @@ def finite(tree):
 )
 def test_exact_corners_give_the_exact_camera(x64, intrinsics, camera):
     camera = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), camera)
-    fit = calibrate(jnp.asarray(BOARD), pictures(camera), intrinsics=intrinsics, shape=SHAPE, sigma=0.1)
+    fit = calibrate(jnp.asarray(BOARD), photos(camera), intrinsics=intrinsics, shape=SHAPE, sigma=0.1)
     assert bool(fit.ok), fit.describe()
     np.testing.assert_allclose(numbers(fit.value.camera), numbers(camera), rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(fit.value.T_camera_board.translation, poses().translation, atol=1e-6)
@@ -94,7 +94,7 @@ def test_exact_corners_give_the_exact_camera(x64, intrinsics, camera):
 def test_parameters_and_sigmas_are_those_of_opencv(x64, rng):
     corners = noisy(rng)
     fit = calibrate(jnp.asarray(BOARD), corners, intrinsics=TWO, shape=SHAPE)
-    places = [np.asarray(picture, np.float32)[:, None] for picture in corners]
+    places = [np.asarray(photo, np.float32)[:, None] for photo in corners]
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-13)
     options = {"flags": cv2.CALIB_FIX_K3, "criteria": stop}
     plane = [BOARD.astype(np.float32)] * NUM
@@ -178,7 +178,7 @@ def test_outliers_are_outvoted(x64, rng):
 
 def test_what_cannot_be_determined(x64, rng):
     corners = noisy(rng)
-    flat = pictures(tilts=np.tile([[0.1, 0.2, -0.1]], (NUM, 1)))
+    flat = photos(tilts=np.tile([[0.1, 0.2, -0.1]], (NUM, 1)))
     for bad in (
         flat,
         flat + 0.1 * jnp.asarray(rng.normal(size=flat.shape)),

@@ -33,7 +33,7 @@ def camera_at(height=0.35, pitch=0.0, lens=None):
     return GroundCamera(pinhole, height, pitch=pitch)
 
 
-def picture(kind, pose, camera=None, seed=0, **scene):
+def photo(kind, pose, camera=None, seed=0, **scene):
     camera = camera_at() if camera is None else camera
     return jnp.asarray(
         render_pallet(kind, np.asarray(pose), camera, shape=SHAPE, scene=PalletScene(**scene), seed=seed)
@@ -55,7 +55,7 @@ def test_pose_and_kind_at_two_meters(index):  # K-14, K-75
     rng = np.random.default_rng(index)
     for seed in range(8):
         pose = np.array([2.0, rng.uniform(-0.2, 0.2), rng.uniform(-0.35, 0.35)])
-        found = detect(picture(TYPES[index], pose, seed=seed), camera_at())
+        found = detect(photo(TYPES[index], pose, seed=seed), camera_at())
         away, turned = errors(found, pose)
         assert bool(found.estimate.ok) and int(found.kind) == index
         assert away < 0.01 and turned < 0.5
@@ -64,7 +64,7 @@ def test_pose_and_kind_at_two_meters(index):  # K-14, K-75
 def test_lens_pitch_and_shading(rng):
     camera = camera_at(0.6, np.radians(12.0), BrownConrady((-0.2, 0.05, 0.0, 0.0)))
     pose = np.array([2.0, -0.1, 0.2])
-    found = detect(picture(TYPES[0], pose, camera, shading=0.6, blur=1.3), camera)
+    found = detect(photo(TYPES[0], pose, camera, shading=0.6, blur=1.3), camera)
     away, turned = errors(found, pose)
     assert bool(found.estimate.ok) and away < 0.01 and turned < 0.5
 
@@ -72,7 +72,7 @@ def test_lens_pitch_and_shading(rng):
 def test_ratio_of_found_edges_is_constant_over_range():  # K-74
     ratios = []
     for x in (1.3, 2.0, 3.0, 3.8):
-        found = detect(picture(TYPES[0], (x, 0.05, 0.0)), camera_at())
+        found = detect(photo(TYPES[0], (x, 0.05, 0.0)), camera_at())
         ratios.append(float(hole_ratio(239.5 - found.columns)))
     np.testing.assert_allclose(ratios, float(TYPES[0].ratio()), rtol=0.01)
 
@@ -82,7 +82,7 @@ def test_covariance_is_consistent():
     for seed in range(24):
         rng = np.random.default_rng(seed)
         pose = (rng.uniform(1.5, 3.5), rng.uniform(-0.2, 0.2), rng.uniform(-0.3, 0.3))
-        found = detect(picture(TYPES[seed % 3], pose, seed=seed), camera_at())
+        found = detect(photo(TYPES[seed % 3], pose, seed=seed), camera_at())
         assert bool(found.estimate.ok)
         squared.append(float(found.estimate.gaussian().mahalanobis_squared(SE2(*pose))))
     low, high = chi2.ppf([0.005, 0.995], 3 * 24) / 24
@@ -92,9 +92,7 @@ def test_covariance_is_consistent():
 def test_confusion_of_the_bank():  # K-75
     view = eqx.filter_jit(lambda image: level_view(image, camera_at()))
     pose = SE2(2.0, 0.0, 0.1)
-    rows = [
-        np.asarray(correlate_types(view(picture(kind, (2.0, 0.0, 0.1))), stack_types(TYPES), pose)) for kind in TYPES
-    ]
+    rows = [np.asarray(correlate_types(view(photo(kind, (2.0, 0.0, 0.1))), stack_types(TYPES), pose)) for kind in TYPES]
     matrix = np.stack(rows)
     assert np.all(np.argmax(matrix, axis=1) == np.arange(3))
     assert np.all(np.diag(matrix) > 0.8) and np.all(matrix - np.diag(np.diag(matrix)) < 0.8)
@@ -103,9 +101,9 @@ def test_confusion_of_the_bank():  # K-75
 def test_wrong_kinds_and_empty_floors_are_rejected():
     only = eqx.filter_jit(lambda image, kind: find_pallet(image, camera_at(), (kind,)))
     for index, kind in enumerate(TYPES):
-        image = picture(kind, (2.0, 0.1, -0.15))
+        image = photo(kind, (2.0, 0.1, -0.15))
         assert [bool(only(image, other).ok) for other in TYPES] == [i == index for i in range(3)]
-    for image in (picture(None, np.zeros(3)), jnp.zeros(SHAPE, jnp.uint8), jnp.full(SHAPE, jnp.nan)):
+    for image in (photo(None, np.zeros(3)), jnp.zeros(SHAPE, jnp.uint8), jnp.full(SHAPE, jnp.nan)):
         found = only(image.astype(jnp.float32), TYPES[0])
         assert not bool(found.ok) and np.all(np.isfinite(found.covariance)) and np.isfinite(found.value.x)
 
@@ -114,8 +112,8 @@ def test_gradient_by_the_picture(x64):
     """Along a change of blur and light, in double precision; an empty image has none."""
     camera = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), camera_at())
     kinds = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), (TYPES[0],))
-    image = picture(TYPES[0], (2.0, 0.1, 0.2)).astype(jnp.float64)
-    direction = picture(TYPES[0], (2.0, 0.13, 0.21), blur=1.2).astype(jnp.float64) - image
+    image = photo(TYPES[0], (2.0, 0.1, 0.2)).astype(jnp.float64)
+    direction = photo(TYPES[0], (2.0, 0.13, 0.21), blur=1.2).astype(jnp.float64) - image
 
     @jax.jit
     def value(image):
