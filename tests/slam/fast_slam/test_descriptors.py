@@ -13,12 +13,12 @@ from jaxloc.sensors import DescribedReading, Increment, IncrementMotion, RangeBe
 from jaxloc.slam.fast_slam import (
     Appearance,
     Appearances,
+    BlockProposal,
     Candidates,
     DescriptorFastSlam,
     FastSlam,
-    BlockProposal,
-    MeasurementProposal,
     Landmarks,
+    MeasurementProposal,
     associate,
 )
 

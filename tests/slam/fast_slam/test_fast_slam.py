@@ -10,7 +10,7 @@ from jaxloc.data.simulate.landmarks import simulate_landmarks
 from jaxloc.filters import run
 from jaxloc.poses import SE2, SO2, local
 from jaxloc.sensors import Increment, IncrementMotion, RangeBearing
-from jaxloc.slam.fast_slam import FastSlam, BlockProposal, MotionProposal, MeasurementProposal, trace_back
+from jaxloc.slam.fast_slam import BlockProposal, FastSlam, MeasurementProposal, MotionProposal, trace_back
 from jaxloc.slam.fast_slam.proposals import Particle
 
 DEVIATIONS = (0.1, 0.03)

@@ -73,46 +73,45 @@ class PathProposal(eqx.Module):
         """A particle after a reading: weight, association and pending density."""
 
 
-class MotionProposal(PathProposal):
+class _PerReadingProposal(PathProposal):
+    """Proposal that draws poses at each reading."""
+
+    @abstractmethod
+    def correctable(self, pending: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+        """The part of the pending covariance of the pose that the reading corrects before the draw."""
+
+    def num_pending(self, capacity: int) -> int:
+        """The pose."""
+        return 3
+
+    def draws_now(self, step: Int[Array, ""]) -> None:
+        """Never: each reading draws."""
+
+    def draw(self, particle: Particle, normal: Float[Array, " d"]) -> Particle:
+        """The particle unchanged."""
+        return particle
+
+    def update_particle(
+        self, landmarks: LandmarkFilter, particle: Particle, observation: Observation, normal: Float[Array, " d"]
+    ) -> ParticleUpdate:
+        """Corrects the motion as far as `correctable`, draws the pose, and updates the map."""
+        return _draw_and_update(landmarks, particle, observation, normal, self.correctable(particle.pending))
+
+
+class MotionProposal(_PerReadingProposal):
     """FastSLAM 1.0 proposal: poses are drawn from the motion model and weighted by the reading."""
 
-    def num_pending(self, capacity: int) -> int:
-        """The pose."""
-        return 3
-
-    def draws_now(self, step: Int[Array, ""]) -> None:
-        """Never: each reading draws."""
-
-    def draw(self, particle: Particle, normal: Float[Array, " d"]) -> Particle:
-        """The particle unchanged."""
-        return particle
-
-    def update_particle(
-        self, landmarks: LandmarkFilter, particle: Particle, observation: Observation, normal: Float[Array, " d"]
-    ) -> ParticleUpdate:
-        """Draws the motion, then weighs it by the reading."""
-        return _draw_and_update(landmarks, particle, observation, normal, jnp.zeros_like(particle.pending))
+    def correctable(self, pending: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+        """Zero: the reading does not correct the motion."""
+        return jnp.zeros_like(pending)
 
 
-class MeasurementProposal(PathProposal):
+class MeasurementProposal(_PerReadingProposal):
     """FastSLAM 2.0 proposal: poses are drawn from motion and reading together, for accurate sensors."""
 
-    def num_pending(self, capacity: int) -> int:
-        """The pose."""
-        return 3
-
-    def draws_now(self, step: Int[Array, ""]) -> None:
-        """Never: each reading draws."""
-
-    def draw(self, particle: Particle, normal: Float[Array, " d"]) -> Particle:
-        """The particle unchanged."""
-        return particle
-
-    def update_particle(
-        self, landmarks: LandmarkFilter, particle: Particle, observation: Observation, normal: Float[Array, " d"]
-    ) -> ParticleUpdate:
-        """Corrects the motion by the reading, then draws."""
-        return _draw_and_update(landmarks, particle, observation, normal, particle.pending)
+    def correctable(self, pending: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+        """All of the motion."""
+        return pending
 
 
 class Decision(eqx.Module):
