@@ -13,8 +13,8 @@ from benchmarks.metric import ACCURACY, REPOSITORY, Metric, quickest, versus
 from jaxloc.features.opencv.chessboard import board_points, find_chessboard
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration import (
-    Corners,
     BrownConradyModel,
+    Corners,
     Intrinsics,
     board_errors,
     calibrate,

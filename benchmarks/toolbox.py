@@ -22,15 +22,15 @@ from jaxloc.filters import (
     Cubature,
     ExtendedKalmanFilter,
     GaussHermite,
-    InteractingFilters,
+    InteractingMultipleModel,
+    InteractingState,
     KalmanFilter,
     LinearSensor,
-    ModesState,
     SigmaPointFilter,
     Unscented,
     run,
     smooth,
-    smooth_modes,
+    smooth_interacting,
 )
 
 
@@ -194,7 +194,7 @@ def maneuvers(runs: int, seed: int = 0, *, whole: bool = True) -> dict[str, Scor
     readings = jnp.asarray(truth[..., :2] + np.sqrt(0.1) * rng.normal(size=(runs, steps, 2)), float)
     sensor = LinearSensor(jnp.eye(2, 6), 0.1 * jnp.eye(2))
     filters = tuple(KalmanFilter(model, sensor) for model in models)
-    bank = InteractingFilters(filters, jnp.array([[0.98, 0.02], [0.02, 0.98]]))
+    bank = InteractingMultipleModel(filters, jnp.array([[0.98, 0.02], [0.02, 0.98]]))
     mean = jnp.array([0.0, 0.0, 0.0, -1.0, 0.0, 0.0])
     priors = [Gaussian(mean, 0.1 * jnp.diag(jnp.array([1.0, 1.0, 1.0, 1.0, a, a]))) for a in (0.0, 5.0)]
     error = _squared_errors(jnp.asarray(truth[..., :2], float))
@@ -219,8 +219,8 @@ def turns(runs: int, seed: int = 0) -> dict[str, Score]:
     straight, turn = KalmanFilter(ConstantVelocity(0.01, padding=1), sensor), CoordinatedTurn(0.0, 0.15)
     chain = jnp.array([[0.9, 0.1], [0.1, 0.9]])
     banks = {
-        "eimm": InteractingFilters((straight, ExtendedKalmanFilter(turn, sensor)), chain),
-        "uimm": InteractingFilters((straight, SigmaPointFilter(turn, sensor, Unscented(kappa=-2.0))), chain),
+        "eimm": InteractingMultipleModel((straight, ExtendedKalmanFilter(turn, sensor)), chain),
+        "uimm": InteractingMultipleModel((straight, SigmaPointFilter(turn, sensor, Unscented(kappa=-2.0))), chain),
     }
     mean = jnp.array([0.0, 0.0, 1.0, 0.0, 0.0])
     priors = [Gaussian(mean, 0.1 * jnp.diag(jnp.array([1.0, 1.0, 1.0, 1.0, w]))) for w in (0.0, 10.0)]
@@ -280,11 +280,11 @@ def _modes_scores(
     states = jax.tree.map(
         lambda *leaves: jnp.stack(leaves), *[filt.init(prior) for filt, prior in zip(bank.filters, priors, strict=True)]
     )
-    start = ModesState(states, jnp.log(jnp.array(shares)), jnp.zeros((), jnp.int32))
+    start = InteractingState(states, jnp.log(jnp.array(shares)), jnp.zeros((), jnp.int32))
 
     def paths(reading):
         _, history = run(bank, start, controls, reading, jnp.ones(controls.shape[0], bool))
-        both = (history.states, smooth_modes(bank, history, controls)) if whole else (history.states,)
+        both = (history.states, smooth_interacting(bank, history, controls)) if whole else (history.states,)
         return [jax.vmap(lambda state: state.combined().mean)(states) for states in both]
 
     # One run after the other: a bank in a batch takes long to compile.

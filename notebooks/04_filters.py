@@ -106,7 +106,7 @@ print(f"position error: filter {rmse(seen.states.mean):.3f} m, smoother {rmse(sm
 dt, position = 0.1, jl.filters.LinearSensor(jnp.eye(2, 6), 0.1 * jnp.eye(2))
 calm = jl.filters.KalmanFilter(jl.filters.ConstantVelocity(0.01, axes=2, padding=2), position)
 wild = jl.filters.KalmanFilter(jl.filters.ConstantAcceleration(1.0, axes=2), position)
-bank = jl.filters.InteractingFilters((calm, wild), jnp.array([[0.98, 0.02], [0.02, 0.98]]))
+bank = jl.filters.InteractingMultipleModel((calm, wild), jnp.array([[0.98, 0.02], [0.02, 0.98]]))
 rng = np.random.default_rng(3)
 acceleration = np.zeros((200, 2))
 acceleration[80:120] = [2.0, -1.5]

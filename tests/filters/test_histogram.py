@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxloc.beliefs import Gaussian, Motion, Sensor
-from jaxloc.filters import GridFilter, KalmanFilter, LinearMotion, LinearSensor, histogram, run
+from jaxloc.filters import HistogramFilter, KalmanFilter, LinearMotion, LinearSensor, histogram, run
 from jaxloc.poses import SE2, local, retract
 
 
@@ -14,7 +14,7 @@ def test_equals_the_kalman_filter(x64, rng):
     sensor = LinearSensor(jnp.array([[1.0]]), jnp.array([[0.8]]))
     prior = Gaussian(jnp.array([1.0]), jnp.array([[2.0]]))
     readings, valid = jnp.asarray(rng.normal(size=(8, 1))), jnp.asarray(rng.uniform(size=8) < 0.8)
-    ours, theirs = GridFilter(motion, sensor), KalmanFilter(motion, sensor)
+    ours, theirs = HistogramFilter(motion, sensor), KalmanFilter(motion, sensor)
     cells = histogram.box((-12.0,), (12.0,), (241,))
     last, history = run(ours, ours.init_gaussian(cells, prior), None, readings, valid)
     exact, peer = run(theirs, theirs.init(prior), None, readings, valid)
@@ -49,7 +49,7 @@ class North(Sensor):
 
 
 def test_poses_conserve_mass_and_wrap():
-    filt = GridFilter(Drift(), North())
+    filt = HistogramFilter(Drift(), North())
     state = filt.init(histogram.plane((-2.0, -1.0), (2.0, 1.0), (4, 3, 16)))
 
     @jax.jit
@@ -68,7 +68,7 @@ def test_poses_conserve_mass_and_wrap():
 
 def test_nonfinite_measurements_change_nothing():
     eye = jnp.eye(1)
-    filt = GridFilter(LinearMotion(eye, eye), LinearSensor(eye, 1e-3 * eye))
+    filt = HistogramFilter(LinearMotion(eye, eye), LinearSensor(eye, 1e-3 * eye))
     state = filt.init(histogram.box((-3.0,), (3.0,), (13,)))
 
     @jax.jit

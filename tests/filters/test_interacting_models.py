@@ -9,7 +9,7 @@ import pytest
 from benchmarks import toolbox
 
 from jaxloc.beliefs import Gaussian
-from jaxloc.filters import InteractingFilters, KalmanFilter, LinearMotion, LinearSensor, run, smooth_modes
+from jaxloc.filters import InteractingMultipleModel, KalmanFilter, LinearMotion, LinearSensor, run, smooth_interacting
 
 STEPS = 5
 TRANSITION = np.array([[0.9, 0.1], [0.3, 0.7]])
@@ -23,7 +23,7 @@ MATRIX, SPREAD = np.array([[1.0, 0.0]]), np.array([[0.2]])
 def bank(transition):
     sensor = LinearSensor(jnp.asarray(MATRIX), jnp.asarray(SPREAD))
     filters = tuple(KalmanFilter(LinearMotion(*map(jnp.asarray, model)), sensor) for model in MODELS)
-    return InteractingFilters(filters, transition)
+    return InteractingMultipleModel(filters, transition)
 
 
 def kalman(mean, covariance, model, reading):
@@ -106,7 +106,7 @@ def results():
         @jax.jit
         def everything(transition):
             filt, (last, history) = filtered(transition)
-            smoothed = smooth_modes(filt, history, None)
+            smoothed = smooth_interacting(filt, history, None)
             combined = [jax.vmap(lambda s: s.combined())(s).mean for s in (history.states, smoothed)]
             return history, smoothed, combined, last
 

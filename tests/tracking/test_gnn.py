@@ -117,7 +117,7 @@ def test_one_scan_is_scipys_assignment(rng):
 
 def test_modes_inside_tracks():  # T-6
     steady, agile = make_filter(0.001), make_filter(10.0)
-    modes = jl.filters.InteractingFilters((steady, agile), jnp.array([[0.95, 0.05], [0.1, 0.9]]))
+    modes = jl.filters.InteractingMultipleModel((steady, agile), jnp.array([[0.95, 0.05], [0.1, 0.9]]))
     tracker = jl.tracking.GlobalNearestNeighbor(make_model(modes), capacity=8)
     times = np.arange(24.0)
     turn = np.where(times < 12, 0.0, times - 12)

@@ -16,9 +16,14 @@ from jaxloc.filters import (
     unscented,
 )
 from jaxloc.filters.extended import ExtendedKalmanFilter
-from jaxloc.filters.histogram import GridFilter, GridInfo, GridState
+from jaxloc.filters.histogram import HistogramFilter, HistogramInfo, HistogramState
 from jaxloc.filters.information import InformationFilter, InformationInfo, InformationState
-from jaxloc.filters.interacting_models import InteractingFilters, ModesInfo, ModesState, smooth_modes
+from jaxloc.filters.interacting_models import (
+    InteractingInfo,
+    InteractingMultipleModel,
+    InteractingState,
+    smooth_interacting,
+)
 from jaxloc.filters.interface import Filter, FilterState, GaussianInfo, GaussianState, History, Info, run
 from jaxloc.filters.kalman import GaussianFilter, KalmanFilter, LinearSensor
 from jaxloc.filters.localization import LocalizationInfo, LocalizationState, MonteCarloLocalization, Place, Recovery
@@ -51,23 +56,23 @@ __all__ = [
     "GaussianFilter",
     "GaussianInfo",
     "GaussianState",
-    "GridFilter",
-    "GridInfo",
-    "GridState",
+    "HistogramFilter",
+    "HistogramInfo",
+    "HistogramState",
     "Guided",
     "History",
     "Info",
     "InformationFilter",
     "InformationInfo",
     "InformationState",
-    "InteractingFilters",
+    "InteractingMultipleModel",
     "KalmanFilter",
     "LinearMotion",
     "LinearSensor",
     "LocalizationInfo",
     "LocalizationState",
-    "ModesInfo",
-    "ModesState",
+    "InteractingInfo",
+    "InteractingState",
     "MonteCarloLocalization",
     "ParticleFilter",
     "ParticleInfo",
@@ -92,7 +97,7 @@ __all__ = [
     "run_parallel",
     "smooth",
     "smooth_fixed_lag",
-    "smooth_modes",
+    "smooth_interacting",
     "smooth_parallel",
     "smoothers",
     "unscented",

@@ -34,7 +34,7 @@ class Cells(eqx.Module):
         return jax.tree.leaves(self.points)[0].shape[0]
 
 
-class GridState(FilterState):
+class HistogramState(FilterState):
     """State of the grid filter.
 
     Attributes:
@@ -58,7 +58,7 @@ class GridState(FilterState):
         return Gaussian(mean, matmul(deviations.T, self.mass[:, None] * deviations))
 
 
-class GridInfo(Info):
+class HistogramInfo(Info):
     """Diagnostics of an update of the grid filter.
 
     Attributes:
@@ -72,7 +72,7 @@ class GridInfo(Info):
     entropy: Float[Array, ""]
 
 
-class GridFilter(Filter):
+class HistogramFilter(Filter):
     """The Bayes filter with the transition density between all pairs of cells, and the likelihood in each.
 
     A prediction costs the square of the number of cells: use at most some thousands. Transition densities are
@@ -88,7 +88,7 @@ class GridFilter(Filter):
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> eye = jnp.eye(1)
-        >>> filt = jl.filters.GridFilter(jl.filters.LinearMotion(eye, eye), jl.filters.LinearSensor(eye, eye))
+        >>> filt = jl.filters.HistogramFilter(jl.filters.LinearMotion(eye, eye), jl.filters.LinearSensor(eye, eye))
         >>> cells = jl.filters.histogram.box((-9.0,), (9.0,), (61,))
         >>> state = filt.init_gaussian(cells, jl.beliefs.Gaussian(jnp.zeros(1), eye))
         >>> state, info = filt.update(filt.predict(state, None), jnp.array([3.0]), jnp.array(True))
@@ -99,17 +99,17 @@ class GridFilter(Filter):
     motion: Motion
     sensor: Sensor
 
-    def init(self, prior: Cells) -> GridState:
+    def init(self, prior: Cells) -> HistogramState:
         """The uniform initial state over the cells."""
         mass = jnp.full(prior.count, 1.0 / prior.count, prior.volume.dtype)
-        return GridState(prior, mass, jnp.zeros((), jnp.int32))
+        return HistogramState(prior, mass, jnp.zeros((), jnp.int32))
 
-    def init_gaussian(self, cells: Cells, prior: Gaussian) -> GridState:
+    def init_gaussian(self, cells: Cells, prior: Gaussian) -> HistogramState:
         """The initial state of a prior density."""
         mass = jax.nn.softmax(jax.vmap(prior.log_prob)(cells.points))
-        return GridState(cells, mass, jnp.zeros((), jnp.int32))
+        return HistogramState(cells, mass, jnp.zeros((), jnp.int32))
 
-    def predict(self, state: GridState, control: Any, *, key: Key[Array, ""] | None = None) -> GridState:
+    def predict(self, state: HistogramState, control: Any, *, key: Key[Array, ""] | None = None) -> HistogramState:
         """The state one step ahead: mass moves between cells by the transition density."""
         del key
         points, control = state.cells.points, tree.finite_or_zero(control)
@@ -121,11 +121,11 @@ class GridFilter(Filter):
         mass = matmul(state.mass, jax.vmap(transition)(points))
         mass = mass / jnp.sum(mass)
         ok = jnp.isfinite(jnp.sum(mass))
-        return GridState(state.cells, jnp.where(ok, mass, state.mass), state.step + 1)
+        return HistogramState(state.cells, jnp.where(ok, mass, state.mass), state.step + 1)
 
     def update(
-        self, state: GridState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
-    ) -> tuple[GridState, GridInfo]:
+        self, state: HistogramState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
+    ) -> tuple[HistogramState, HistogramInfo]:
         """The state updated by a measurement."""
         del key
         scores = jax.vmap(lambda point: self.sensor.log_prob(point, measurement, valid))(state.cells.points)
@@ -136,13 +136,13 @@ class GridFilter(Filter):
         likelihood = jax.nn.logsumexp(jnp.where(ok, joint, 0.0))
         mass = jnp.where(ok, jnp.exp(jnp.where(fits, joint - likelihood, -jnp.inf)), state.mass)
         seen = jnp.any(self._mask(state, measurement, valid))
-        after = tree.where(seen, GridState(state.cells, mass, state.step), state)
+        after = tree.where(seen, HistogramState(state.cells, mass, state.step), state)
         entropy = -jnp.sum(
             jnp.where(after.mass > 0.0, after.mass * jnp.log(jnp.where(after.mass > 0.0, after.mass, 1.0)), 0.0)
         )
-        return after, GridInfo(jnp.where(ok & seen, likelihood, 0.0), ok, entropy)
+        return after, HistogramInfo(jnp.where(ok & seen, likelihood, 0.0), ok, entropy)
 
-    def _mask(self, state: GridState, measurement: Any, valid: Bool[Array, "*m"]) -> Bool[Array, " m"]:
+    def _mask(self, state: HistogramState, measurement: Any, valid: Bool[Array, "*m"]) -> Bool[Array, " m"]:
         """Mask of the valid directions of the measurement, at the first cell."""
         first = jax.tree.map(lambda leaf: leaf[0], state.cells.points)
         return innovation(self.sensor.expect(first, measurement), measurement, valid)[1]

@@ -18,7 +18,7 @@ from jaxloc.filters.unscented import intrinsic_mean
 from jaxloc.poses import carry, is_flat, local
 
 
-class ModesState(FilterState):
+class InteractingState(FilterState):
     """State of the IMM filter: a density for each mode, and the mode probabilities.
 
     Attributes:
@@ -45,7 +45,7 @@ class ModesState(FilterState):
         return self.combined().gaussian()
 
 
-class ModesInfo(Info):
+class InteractingInfo(Info):
     """Diagnostics of an update of the IMM filter.
 
     Attributes:
@@ -61,7 +61,7 @@ class ModesInfo(Info):
     modes: GaussianInfo
 
 
-class InteractingFilters(Filter):
+class InteractingMultipleModel(Filter):
     """The interacting multiple model (IMM) filter: one filter of the Kalman family per mode, mixed before each step.
 
     The mode is a Markov chain, ``p(s' = j | s = i) = transition[i, j]``. A prediction mixes the states of all modes for
@@ -83,7 +83,7 @@ class InteractingFilters(Filter):
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> sensor = jl.filters.LinearSensor(jnp.eye(1, 2), 0.01 * jnp.eye(1))
         >>> modes = [jl.filters.KalmanFilter(jl.filters.ConstantVelocity(q, axes=1), sensor) for q in (1e-4, 10.0)]
-        >>> filt = jl.filters.InteractingFilters(tuple(modes), jnp.array([[0.9, 0.1], [0.1, 0.9]]))
+        >>> filt = jl.filters.InteractingMultipleModel(tuple(modes), jnp.array([[0.9, 0.1], [0.1, 0.9]]))
         >>> state = filt.init(jl.beliefs.Gaussian(jnp.zeros(2), 0.01 * jnp.eye(2)))
         >>> state, info = filt.update(filt.predict(state, jnp.array(1.0)), jnp.array([2.0]), jnp.array(True))
         >>> bool(info.probabilities[1] > 0.9)
@@ -100,7 +100,7 @@ class InteractingFilters(Filter):
                 f"{count} filters need a transition matrix of shape ({count}, {count}); got {self.transition.shape}."
             )
 
-    def init(self, prior: Gaussian, probabilities: Float[Array, " k"] | None = None) -> ModesState:
+    def init(self, prior: Gaussian, probabilities: Float[Array, " k"] | None = None) -> InteractingState:
         """The state of a prior density.
 
         Args:
@@ -111,9 +111,9 @@ class InteractingFilters(Filter):
         if probabilities is None:
             probabilities = jnp.full(count, 1.0 / count, self.transition.dtype)
         states = _stack([filt.init(prior) for filt in self.filters])
-        return ModesState(states, log_probability(probabilities), jnp.zeros((), jnp.int32))
+        return InteractingState(states, log_probability(probabilities), jnp.zeros((), jnp.int32))
 
-    def predict(self, state: ModesState, control: Any, *, key: Key[Array, ""] | None = None) -> ModesState:
+    def predict(self, state: InteractingState, control: Any, *, key: Key[Array, ""] | None = None) -> InteractingState:
         """The state one step ahead: mixed for each mode, then predicted by its filter."""
         del key
         joint = state.log_probabilities[:, None] + log_probability(self.transition)
@@ -121,11 +121,11 @@ class InteractingFilters(Filter):
         weights = jnp.exp(joint - predicted[None, :])
         mixed = jax.vmap(mix, in_axes=(None, 1))(state.states, weights)
         moved = [filt.predict(one, control) for filt, one in zip(self.filters, unstack(mixed), strict=True)]
-        return ModesState(_stack(moved), predicted, state.step + 1)
+        return InteractingState(_stack(moved), predicted, state.step + 1)
 
     def update(
-        self, state: ModesState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
-    ) -> tuple[ModesState, ModesInfo]:
+        self, state: InteractingState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
+    ) -> tuple[InteractingState, InteractingInfo]:
         """The state updated by a measurement."""
         del key
         pairs = [
@@ -136,14 +136,14 @@ class InteractingFilters(Filter):
         likelihood = jax.nn.logsumexp(joint)
         ok = jnp.all(infos.ok)
         log_probabilities = jnp.where(ok, joint - likelihood, state.log_probabilities)
-        after = ModesState(states, log_probabilities, state.step)
-        return after, ModesInfo(jnp.where(ok, likelihood, 0.0), ok, after.probabilities, infos)
+        after = InteractingState(states, log_probabilities, state.step)
+        return after, InteractingInfo(jnp.where(ok, likelihood, 0.0), ok, after.probabilities, infos)
 
 
 @eqx.filter_jit
-def smooth_modes(
-    filt: InteractingFilters, history: History, controls: Any, *, active: Bool[Array, " t"] | None = None
-) -> ModesState:
+def smooth_interacting(
+    filt: InteractingMultipleModel, history: History, controls: Any, *, active: Bool[Array, " t"] | None = None
+) -> InteractingState:
     """Modes and states of a run given all its measurements: the IMM smoother.
 
     In each backward step, the likelihood of later measurements is, for each mode, the ratio of the smoothed and the
@@ -168,11 +168,11 @@ def smooth_modes(
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> sensor = jl.filters.LinearSensor(jnp.eye(1, 2), 0.01 * jnp.eye(1))
         >>> modes = [jl.filters.KalmanFilter(jl.filters.ConstantVelocity(q, axes=1), sensor) for q in (1e-4, 10.0)]
-        >>> filt = jl.filters.InteractingFilters(tuple(modes), jnp.array([[0.9, 0.1], [0.1, 0.9]]))
+        >>> filt = jl.filters.InteractingMultipleModel(tuple(modes), jnp.array([[0.9, 0.1], [0.1, 0.9]]))
         >>> start = filt.init(jl.beliefs.Gaussian(jnp.zeros(2), 0.01 * jnp.eye(2)))
         >>> dt, z = jnp.ones(4), jnp.array([[0.0], [0.0], [2.0], [4.0]])
         >>> _, history = jl.filters.run(filt, start, dt, z, jnp.ones(4, bool))
-        >>> jl.filters.smooth_modes(filt, history, dt).probabilities.shape
+        >>> jl.filters.smooth_interacting(filt, history, dt).probabilities.shape
         (4, 2)
     """
     states = history.states
@@ -184,7 +184,7 @@ def smooth_modes(
     def back(smoothed, inputs):
         state, (control, here) = inputs
         earlier = _smooth_back(filt, state, control, smoothed)
-        held = ModesState(_renumber(smoothed.states, state.step), smoothed.log_probabilities, state.step)
+        held = InteractingState(_renumber(smoothed.states, state.step), smoothed.log_probabilities, state.step)
         earlier = tree.where(here, earlier, held)
         return earlier, earlier
 
@@ -192,7 +192,9 @@ def smooth_modes(
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), smoothed, last)
 
 
-def _smooth_back(filt: InteractingFilters, state: ModesState, control: Any, smoothed: ModesState) -> ModesState:
+def _smooth_back(
+    filt: InteractingMultipleModel, state: InteractingState, control: Any, smoothed: InteractingState
+) -> InteractingState:
     """One step back of the smoother, over all pairs (mode before, mode after)."""
     predicted, pairs, scores = filt.predict(state, control), [], []
     for mode, expected, after in zip(filt.filters, unstack(predicted.states), unstack(smoothed.states), strict=True):
@@ -214,7 +216,7 @@ def _smooth_back(filt: InteractingFilters, state: ModesState, control: Any, smoo
     total = jax.nn.logsumexp(joint, axis=0)
     weights = jnp.exp(joint - total[None, :])
     merged = jax.vmap(mix, in_axes=(1, 1))(_stack(pairs), weights)
-    return ModesState(_renumber(merged, state.step), total, state.step)
+    return InteractingState(_renumber(merged, state.step), total, state.step)
 
 
 class Evidence(eqx.Module):

@@ -23,7 +23,7 @@ class GlobalNearestNeighbor(TrackTable, Tracker):
     initiate new tracks.
 
     Args:
-        model: the target model; its filter may be an `InteractingFilters`.
+        model: the target model; its filter may be an `InteractingMultipleModel`.
         capacity: number of slots for tracks, tentative ones included.
         gate: probability that a track's own measurement passes; None for no gate.
         logic: when tracks are confirmed and deleted.

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _tree as tree
 from jaxloc.beliefs import Gaussian, chi2_quantile
-from jaxloc.filters import GaussianFilter, GaussianState, InteractingFilters
+from jaxloc.filters import GaussianFilter, GaussianState, InteractingMultipleModel
 from jaxloc.tracking.gating import Comparison, compare, corrected, usable_measurements
 from jaxloc.tracking.models.birth import StaticBirth
 from jaxloc.tracking.models.target import TargetModel
@@ -43,7 +43,7 @@ class Scan(eqx.Module):
     Attributes:
         measurements: finite everywhere.
         valid: mask of the measurements.
-        comparison: of Gaussian tracks with them; None for tracks of `InteractingFilters`.
+        comparison: of Gaussian tracks with them; None for tracks of `InteractingMultipleModel`.
         detection: p_D of each track.
         log_missed: ``log (1 - r p_D)``.
         log_odds: ``log (r p_D N(z; ...) / (kappa + b))``; minus infinity outside the gate.
@@ -154,9 +154,9 @@ def _likelihoods(
     if isinstance(filt, GaussianFilter):
         comparison = compare(filt, states.mean, states.covariance_sqrt, measurements, present, gate)
         return comparison.log_likelihood, comparison
-    if not isinstance(filt, InteractingFilters):
+    if not isinstance(filt, InteractingMultipleModel):
         raise TypeError(
-            f"Trackers need a filter of the Kalman family or InteractingFilters; got {type(filt).__name__}."
+            f"Trackers need a filter of the Kalman family or InteractingMultipleModel; got {type(filt).__name__}."
         )
 
     def pair(state, z, here):

@@ -72,7 +72,7 @@ class MultipleHypothesisTracker(Tracker):
     Labels are unique, but not consecutive: a tree has the label of its first measurement.
 
     Args:
-        model: the target model; its filter may be an `InteractingFilters`.
+        model: the target model; its filter may be an `InteractingMultipleModel`.
         leaves: capacity for single-target hypotheses.
         tracks: largest number of tracks in a global hypothesis.
         hypotheses: number of global hypotheses kept.

@@ -83,7 +83,7 @@ def require_gaussian(model: TargetModel, name: str) -> None:
     if isinstance(model, TargetModel) and not isinstance(model.filter, GaussianFilter):
         raise TypeError(
             f"{name} needs a model with a filter of the Kalman family; got {type(model.filter).__name__}. "
-            "GlobalNearestNeighbor takes InteractingFilters."
+            "GlobalNearestNeighbor takes InteractingMultipleModel."
         )
 
 

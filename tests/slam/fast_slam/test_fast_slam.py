@@ -57,7 +57,10 @@ def laps():
 
             return jax.jit(jax.vmap(one))(worlds, keys)
 
-        return worlds, {type(p).__name__: solve(fast(proposal=p)) for p in (MotionProposal(), MeasurementProposal(), BlockProposal(40))}
+        return worlds, {
+            type(p).__name__: solve(fast(proposal=p))
+            for p in (MotionProposal(), MeasurementProposal(), BlockProposal(40))
+        }
 
 
 def map_error(worlds, end):
@@ -90,7 +93,9 @@ def test_maps_are_near_those_of_ekf_slam(laps, x64):
     for _, infos, _, _ in answers.values():
         assert bool(infos.ok.all()) and np.isfinite(infos.log_likelihood).all()
     # The better proposal keeps more particles alive.
-    effective = [np.asarray(answers[name][1].ess).mean() for name in ("MotionProposal", "MeasurementProposal", "BlockProposal")]
+    effective = [
+        np.asarray(answers[name][1].ess).mean() for name in ("MotionProposal", "MeasurementProposal", "BlockProposal")
+    ]
     assert effective[2] > effective[1] > effective[0]
 
 

@@ -29,9 +29,9 @@ class Appearance(eqx.Module):
     Args:
         deviation: standard deviation of their distance, in units of the descriptor.
         reach: the distance beyond which they are not of one landmark; None for three deviations.
-        new_density: density of readings of new landmarks whose descriptor matches a known one, per meter and radian: how
-            often there is one, over the area where it may lie. None for one in a thousand of the density at a perfectly
-            known one.
+        new_density: density of readings of new landmarks whose descriptor matches a known one, per meter and radian:
+            how often there is one, over the area where it may lie. None for one in a thousand of the density at a
+            perfectly known one.
 
     Example:
         >>> import jax.numpy as jnp

@@ -80,7 +80,7 @@ class TargetModel(eqx.Module):
     Args:
         filter: the filter of one target, with motion and sensor model: a `KalmanFilter` for linear models,
             an `ExtendedKalmanFilter` (one iteration) or a `SigmaPointFilter`. Its own gate is not used. Some trackers
-            take `InteractingFilters` as well.
+            take `InteractingMultipleModel` as well.
         detection: p_D, a number or a `Detection`.
         survival: p_S, probability that a target exists at the next scan.
         clutter: false measurements.
