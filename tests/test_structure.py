@@ -109,6 +109,18 @@ def test_unstable_modules_of_jax_are_guarded(path):
     assert not found, found
 
 
+TESTS = sorted(path for path in (REPOSITORY / "tests").glob("*/**/test_*.py"))
+
+
+@pytest.mark.parametrize("path", TESTS, ids=lambda path: str(path.relative_to(REPOSITORY / "tests")))
+def test_tests_mirror_the_package(path):
+    """`tests/<room>/test_<module>.py`, also `test_<module>_<aspect>.py`, or named after its folder."""
+    folder = SOURCE / path.parent.relative_to(REPOSITORY / "tests")
+    name = path.stem.removeprefix("test_")
+    modules = {module.stem for module in folder.glob("*.py")} | {folder.name}
+    assert any(name == module or name.startswith(f"{module}_") for module in modules), f"no module {name} in {folder}"
+
+
 def class_bases() -> dict[str, list[str]]:
     """Every class of jaxloc with the names of its bases."""
     found = {}

@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from jaxloc.cli import run
-from jaxloc.data import covariance, kitti, tum
+from jaxloc.data import covariance_csv, kitti, tum
 
 FILES = ["config.yaml", "covariance.csv", "metrics.json", "report.html", "trajectory.tum", "trajectory.txt"]
 
@@ -19,7 +19,7 @@ def test_an_interrupt_keeps_what_was_done(pipeline, sequence, tmp_path):
     # The frame in which Ctrl-C came is finished.
     assert len(kitti.read_poses(out / "trajectory.txt")) == 4
     assert len(tum.read_trajectory(out / "trajectory.tum").trajectory) == 4
-    assert covariance.read_covariances(out / "covariance.csv").shape == (4, 6, 6)
+    assert covariance_csv.read_covariances(out / "covariance.csv").shape == (4, 6, 6)
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["frames"] == 4 and metrics["interrupted"] is True
     assert "Interrupted" in (out / "report.html").read_text()

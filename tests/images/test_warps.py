@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxloc.images.matrix_exponential import exponential_less_identity, logarithm
 from jaxloc.images.warps import Affine, Euclidean, Homography, Similarity, Translation, tangent_matrix
 from jaxloc.poses import local, retract, tangent_labels
+from jaxloc.poses.matrix_exponential import exponential_less_identity, logarithm
 
 GROUPS = [Translation, Euclidean, Similarity, Affine, Homography]
 SIZES = np.array([5.0, 5.0, 0.5, 0.3, 0.3, 0.3, 1e-3, 1e-3])

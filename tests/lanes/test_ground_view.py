@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxloc as jl
-from jaxloc.lanes.ground_view import GroundGrid
+from jaxloc.lanes.ground_view import GroundGrid, inverse_perspective
 
 SHAPE = (120, 160)
 LENS = jl.sensors.BrownConrady

@@ -3,7 +3,7 @@
 from jaxloc.data import (
     camera_file,
     carmen,
-    covariance,
+    covariance_csv,
     gtsam_stereo,
     io,
     kitti,
@@ -15,7 +15,7 @@ from jaxloc.data import (
     stereo_sequence,
     tracking,
     tum,
-    wean,
+    wean_hall,
 )
 from jaxloc.data.io.errors import DataError
 from jaxloc.data.kitti import KittiSequence
@@ -37,7 +37,7 @@ __all__ = [
     "StreetSequence",
     "camera_file",
     "carmen",
-    "covariance",
+    "covariance_csv",
     "gtsam_stereo",
     "io",
     "kitti",
@@ -52,5 +52,5 @@ __all__ = [
     "stereo_sequence",
     "tracking",
     "tum",
-    "wean",
+    "wean_hall",
 ]

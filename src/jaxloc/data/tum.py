@@ -110,3 +110,15 @@ def write_trajectory(path: Path | str, trajectory: Trajectory, *, start: float =
         format_pose(float(time), matrix) for time, matrix in zip(times, np.asarray(trajectory.matrices()), strict=True)
     )
     write_file(path, "".join(row + "\n" for row in rows))
+
+
+def planar_poses(stamped: StampedTrajectory) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
+    """Absolute stamps and planar poses (x, y, heading) of a trajectory.
+
+    Args:
+        stamped: a trajectory; its heights, rolls and pitches are ignored.
+    """
+    matrices = np.asarray(stamped.trajectory.matrices(), dtype=np.float64)
+    times = np.asarray(stamped.trajectory.times, dtype=np.float64) + stamped.start
+    heading = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
+    return times, np.column_stack([matrices[:, :2, 3], heading])

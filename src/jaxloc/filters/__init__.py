@@ -35,7 +35,7 @@ from jaxloc.filters.motion_models import (
     LinearMotion,
     TwistMotion,
 )
-from jaxloc.filters.parallel.gaussian import run_parallel, smooth_parallel
+from jaxloc.filters.parallel.filter_smoother import run_parallel, smooth_parallel
 from jaxloc.filters.particle import ParticleFilter, ParticleInfo, ParticleState
 from jaxloc.filters.proposals import Auxiliary, Bootstrap, Guided
 from jaxloc.filters.smoothers import smooth, smooth_fixed_lag

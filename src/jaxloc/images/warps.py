@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxloc._linalg import matmul
-from jaxloc.images.matrix_exponential import exponential_less_identity, logarithm
 from jaxloc.poses import SE2
 from jaxloc.poses.lie_group import Group
+from jaxloc.poses.matrix_exponential import exponential_less_identity, logarithm
 
 _LABELS = ("right", "down", "rotation", "scale", "stretch", "shear", "perspective right", "perspective down")
 _FAR = -1e6  # coordinates of points at or beyond the horizon, outside every image, px

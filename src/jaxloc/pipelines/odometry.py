@@ -23,7 +23,7 @@ from jaxloc.odometry import (
     match_frames,
     match_stereo,
 )
-from jaxloc.pipelines.images import check_stereo_images
+from jaxloc.pipelines.input_checks import check_stereo_images
 from jaxloc.pipelines.stopwatch import Stopwatch
 from jaxloc.poses import SE3
 from jaxloc.refinement import StereoMatches

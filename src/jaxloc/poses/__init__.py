@@ -1,6 +1,19 @@
 """Rotations and poses: Lie groups, retraction of any pytree along its tangent space, and trajectories."""
 
-from jaxloc.poses import compound, direction, lie_group, manifold, planar, se2, se3, series, so2, so3, trajectory
+from jaxloc.poses import (
+    compound,
+    direction,
+    lie_group,
+    manifold,
+    matrix_exponential,
+    planar,
+    se2,
+    se3,
+    series,
+    so2,
+    so3,
+    trajectory,
+)
 from jaxloc.poses.direction import Direction
 from jaxloc.poses.lie_group import Group
 from jaxloc.poses.manifold import carry, is_flat, local, retract, tangent_dimension, tangent_labels
@@ -27,6 +40,7 @@ __all__ = [
     "lie_group",
     "local",
     "manifold",
+    "matrix_exponential",
     "planar",
     "retract",
     "se2",

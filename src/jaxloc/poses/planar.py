@@ -80,3 +80,16 @@ def interpolate_poses(
     """Linear interpolation of planar poses in time, of headings along the shorter arc."""
     headings = np.unwrap(poses[:, 2])
     return np.stack([np.interp(at, times, column) for column in (*poses[:, :2].T, headings)], axis=1)
+
+
+def planar_matrix(pose: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
+    """The spatial pose of a planar one, at height zero.
+
+    Args:
+        pose: (x, y, heading), m and rad.
+    """
+    x, y, heading = pose
+    matrix = np.eye(4)
+    matrix[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
+    matrix[:2, 3] = x, y
+    return matrix

@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from jaxloc.beliefs import Particles, resampling
-from jaxloc.beliefs.resampling.strategies import (
-    Multinomial,
-    OptimalTransport,
-    Residual,
-    Soft,
-    Stratified,
-    Systematic,
-)
+from jaxloc.beliefs.resampling.strategies import Multinomial, OptimalTransport, Residual, Soft, Stratified, Systematic
 
 
 @pytest.mark.parametrize(

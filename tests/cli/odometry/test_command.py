@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from jaxloc.cli import run
-from jaxloc.data import covariance, kitti, tum
+from jaxloc.data import covariance_csv, kitti, tum
 
 FILES = ["config.yaml", "covariance.csv", "metrics.json", "report.html", "trajectory.tum", "trajectory.txt"]
 
@@ -24,7 +24,7 @@ def test_odometry_writes_every_file(pipeline, sequence, tmp_path, capsys):
     stamped = tum.read_trajectory(out / "trajectory.tum", start=0.0).trajectory
     np.testing.assert_allclose(stamped.times, 0.1 * np.arange(6), atol=1e-6)
     np.testing.assert_allclose(stamped.positions, path.positions, atol=1e-6)
-    covariances = covariance.read_covariances(out / "covariance.csv")
+    covariances = covariance_csv.read_covariances(out / "covariance.csv")
     np.testing.assert_allclose(covariances, 1e-4 * np.arange(6)[:, None, None] * np.eye(6))
 
     metrics = json.loads((out / "metrics.json").read_text())

@@ -11,7 +11,7 @@ import jaxloc as jl
 from jaxloc.data.simulate.road.drive import Course, drive
 from jaxloc.data.simulate.road.rendering import Road, Streak
 from jaxloc.lanes import ralph
-from jaxloc.lanes.ground_view import GroundGrid
+from jaxloc.lanes.ground_view import GroundGrid, inverse_perspective
 
 pytestmark = pytest.mark.heavy
 

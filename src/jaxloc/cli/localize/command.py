@@ -9,10 +9,11 @@ import numpy as np
 from jaxloc.cli import lifecycle
 from jaxloc.cli.lifecycle import Arguments
 from jaxloc.cli.localize import report
-from jaxloc.cli.planar import planar_matrix, planar_poses
 from jaxloc.data import DataError, LaserLog, carmen, ros_map, tum
 from jaxloc.data.io.writing import RowWriter
+from jaxloc.data.tum import planar_poses
 from jaxloc.poses import SE2
+from jaxloc.poses.planar import planar_matrix
 from jaxloc.sensors import OccupancyMap
 
 _FILES = {

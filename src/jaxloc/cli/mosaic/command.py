@@ -10,12 +10,11 @@ import numpy as np
 from jaxloc.cli import lifecycle
 from jaxloc.cli.lifecycle import Arguments
 from jaxloc.cli.mosaic import report
-from jaxloc.cli.planar import planar_matrix, planar_poses
 from jaxloc.data import DataError, tum
 from jaxloc.data.camera_file import read_camera
 from jaxloc.data.io.writing import write_file
-from jaxloc.data.tum import StampedTrajectory
-from jaxloc.poses.planar import relative_poses
+from jaxloc.data.tum import StampedTrajectory, planar_poses
+from jaxloc.poses.planar import planar_matrix, relative_poses
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 _LIGHTEST = 255.0

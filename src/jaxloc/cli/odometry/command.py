@@ -11,10 +11,10 @@ from jaxloc.cli import lifecycle, session
 from jaxloc.cli.lifecycle import Arguments
 from jaxloc.cli.odometry import report
 from jaxloc.cli.track.stereo import command as stereo
-from jaxloc.data import StereoSequence, covariance, kitti, simulate_street, tum
+from jaxloc.data import StereoSequence, covariance_csv, kitti, simulate_street, tum
 from jaxloc.data.io.writing import RowWriter
 
-_FILES = {"trajectory.txt": None, "trajectory.tum": None, "covariance.csv": covariance.HEADER}
+_FILES = {"trajectory.txt": None, "trajectory.tum": None, "covariance.csv": covariance_csv.HEADER}
 
 
 def default_config() -> Any:
@@ -83,7 +83,7 @@ def _run(sequence: StereoSequence, config: Any, out: Path, inputs: dict[str, Any
         matrix = np.asarray(output.pose.matrix(), dtype=np.float64)
         rows["trajectory.txt"].append(kitti.format_pose(matrix))
         rows["trajectory.tum"].append(tum.format_pose(float(output.time), matrix))
-        rows["covariance.csv"].append(covariance.format_covariance(len(record.matrices), output.covariance))
+        rows["covariance.csv"].append(covariance_csv.format_covariance(len(record.matrices), output.covariance))
         record.add(output, matrix)
 
     with lifecycle.open_run(out) as run:

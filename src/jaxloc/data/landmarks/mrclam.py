@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxloc.data.io.errors import DataError
 from jaxloc.data.io.text import parse_numbers, read_rows
-from jaxloc.data.landmarks.log import LandmarkLog, assemble, ranges_and_bearings
+from jaxloc.data.landmarks.landmark_log import LandmarkLog, assemble, ranges_and_bearings
 from jaxloc.poses.planar import dead_reckon, interpolate_poses
 
 _LARGEST = 256 * 2**20  # bytes of one unpacked file: an hour of this robot has a few

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxloc.data.io.errors import DataError
 from jaxloc.data.io.text import check_increasing, read_rows
-from jaxloc.data.landmarks.log import LandmarkLog, assemble, ranges
+from jaxloc.data.landmarks.landmark_log import LandmarkLog, assemble, ranges
 from jaxloc.poses.planar import interpolate_poses
 
 _UNRELATED_TRUTH = 1.0  # s without truth beyond which interpolating it means nothing

@@ -1,6 +1,6 @@
 """Filters and smoothers that are parallel in time, by associative scans."""
 
-from jaxloc.filters.parallel import associative_scan, gaussian
+from jaxloc.filters.parallel import associative_scan, filter_smoother
 from jaxloc.filters.parallel.associative_scan import (
     Block,
     Line,
@@ -10,7 +10,7 @@ from jaxloc.filters.parallel.associative_scan import (
     scan_associative,
     smooth_blocks,
 )
-from jaxloc.filters.parallel.gaussian import run_parallel, smooth_parallel
+from jaxloc.filters.parallel.filter_smoother import run_parallel, smooth_parallel
 
 __all__ = [
     "Block",
@@ -18,7 +18,7 @@ __all__ = [
     "Linearized",
     "associative_scan",
     "filter_blocks",
-    "gaussian",
+    "filter_smoother",
     "hold",
     "run_parallel",
     "scan_associative",

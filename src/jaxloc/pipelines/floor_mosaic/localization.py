@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from jaxloc.pipelines.floor_mosaic.mosaic import FloorMosaic, Frame
 from jaxloc.pipelines.floor_mosaic.options import Config
 from jaxloc.pipelines.floor_mosaic.registration import odometry_covariances, pose_of_row, row_of_pose
-from jaxloc.pipelines.images import check_image
+from jaxloc.pipelines.input_checks import check_image
 from jaxloc.poses.planar import compose_poses
 from jaxloc.slam.mosaic import FloorView, Patch, Rectifier, track
 

@@ -25,7 +25,7 @@ from jaxloc.pipelines.floor_mosaic.registration import (
     optimize_poses,
     planar,
 )
-from jaxloc.pipelines.images import check_image
+from jaxloc.pipelines.input_checks import check_image
 from jaxloc.sensors.ground_camera import GroundCamera
 from jaxloc.slam.mosaic import FloorView, Overlap, Patch, Raster, Rectifier, blend, enclose, fit_falloff
 

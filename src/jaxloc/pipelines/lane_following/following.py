@@ -22,7 +22,7 @@ from jaxloc.lanes.departure import time_to_line_crossing
 from jaxloc.lanes.dickmanns import LaneMotion, Ride, RoadState, Windows
 from jaxloc.lanes.ground_view import GroundGrid
 from jaxloc.lanes.ralph import Template
-from jaxloc.pipelines.images import check_image
+from jaxloc.pipelines.input_checks import check_image
 from jaxloc.pipelines.lane_following import lane_tracker
 from jaxloc.pipelines.lane_following.lane_tracker import LaneTracker, Update
 from jaxloc.pipelines.lane_following.pitch import Pitch, estimate_pitch

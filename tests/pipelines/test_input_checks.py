@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from jaxloc.pipelines.images import check_image, check_stereo_images
+from jaxloc.pipelines.input_checks import check_image, check_stereo_images
 
 GRAY = np.zeros((4, 6), np.uint8)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxloc.data.io.errors import DataError
 from jaxloc.data.io.text import parse_numbers, read_text
-from jaxloc.data.landmarks.log import LandmarkLog, assemble, ranges_and_bearings
+from jaxloc.data.landmarks.landmark_log import LandmarkLog, assemble, ranges_and_bearings
 from jaxloc.poses.planar import compose_poses
 
 _NUMBERS = {"ODOMETRY": 11, "LANDMARK": 7}
