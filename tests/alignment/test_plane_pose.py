@@ -29,6 +29,7 @@ def scene():
     return plane, pose, photo.image
 
 
+@pytest.mark.slow
 def test_pose_is_found_under_another_exposure(scene):
     plane, truth, photo = scene
     rng = np.random.default_rng(1)
@@ -56,6 +57,7 @@ def test_covariance_is_consistent(scene):
     assert low < float(jnp.mean(values)) < high
 
 
+@pytest.mark.slow
 def test_degenerate_inputs_are_flagged(scene):
     plane, truth, photo = scene
     away = truth @ SE3.exp(jnp.array([0.0, 0.0, 0.0, np.pi, 0.0, 0.0]))

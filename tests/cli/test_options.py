@@ -25,6 +25,7 @@ NAMES = (
 )
 
 
+@pytest.mark.slow
 def test_options_come_from_a_file_or_from_an_earlier_run(pipeline, sequence, tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text("threshold: 3\nkernel:\n  scale: 0.5\n")

@@ -85,6 +85,7 @@ def test_descriptors_know_no_gain_and_bias(photo):
     np.testing.assert_allclose(jnp.linalg.norm(plain.values, axis=1), 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_equal_differences(x64, photo):
     image = jnp.asarray(cv2.GaussianBlur(photo, (0, 0), 1.0)[60:124, 190:254], jnp.float64)
     change = jnp.asarray(np.random.default_rng(0).normal(size=image.shape))
@@ -102,6 +103,7 @@ def test_gradients_equal_differences(x64, photo):
     np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0.0, 120.0, np.nan])
 def test_blank_images(value):
     def total(image):

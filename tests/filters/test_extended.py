@@ -96,6 +96,7 @@ def test_consistent_on_poses(drives, kind):
         assert share >= 0.8 and bias < 0.03
 
 
+@pytest.mark.slow
 def test_iterated_update_is_the_most_probable_pose(x64):
     motion, sensor = models()
     filt = ExtendedKalmanFilter(motion, sensor, iterations=8)

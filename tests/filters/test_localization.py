@@ -82,6 +82,7 @@ def test_a_known_initial_pose_is_tracked_with_consistent_covariances(world, trac
     assert 3.0 / 3.0 < float(jnp.mean(nees)) < chi2.ppf(0.999, 3 * 17) / 17
 
 
+@pytest.mark.slow
 def test_global_localization_finds_the_robot(world):
     ends = []
     for seed in range(3):
@@ -218,6 +219,7 @@ def test_share_of_random_poses_follows_the_fit():
     assert float(recovery.share(mean)) == pytest.approx(1 - np.exp(-0.7), abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 def test_a_real_building(recordings):
     folder = recordings / "mcl_fr079"

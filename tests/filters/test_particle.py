@@ -87,6 +87,7 @@ def growth_errors(runs, steps, particles, seed, q, r, start_variance, initial=0.
     return (np.asarray(found)[..., 0] - states) ** 2
 
 
+@pytest.mark.slow
 def test_growth_model_table_of_the_toolbox():  # bootstrap, 1000 particles, 100 runs of 500 steps: 10.2
     errors = growth_errors(100, 500, 1000, 0, 1.0, 1.0, 1.0, 0.1)
     assert abs(errors.mean() - 10.2) < 0.4

@@ -116,10 +116,12 @@ def expected():
     return float(value)
 
 
+@pytest.mark.slow
 def test_eight_devices_equal_one(expected):
     assert np.isfinite(expected)
 
 
+@pytest.mark.slow
 def test_two_processes_equal_one(expected):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -161,6 +161,7 @@ class Fix(Sensor):
         return 0.04 * jnp.eye(2, dtype=state.translation.dtype)
 
 
+@pytest.mark.slow
 def test_iterated_parallel_run_ends_at_the_most_probable_path(x64, rng):
     steps, deviations = 8, np.sqrt([0.01, 0.01, 0.05])
     filt = ExtendedKalmanFilter(TwistMotion(jnp.diag(jnp.asarray(deviations) ** 2)), Fix())

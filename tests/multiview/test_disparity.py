@@ -170,6 +170,7 @@ def test_shapes_must_agree():
         match(np.zeros((4, 5)), np.zeros((4, 6)))
 
 
+@pytest.mark.slow
 def test_a_real_pair():
     """The motorcycle of Middlebury: not worse than OpenCV's semi-global matcher, and without its steps."""
     data = pytest.importorskip("skimage.data")

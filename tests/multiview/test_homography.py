@@ -98,6 +98,7 @@ def test_consistency(x64):
     assert 7.2 < np.mean([squared(seed) for seed in range(200)]) < 8.8
 
 
+@pytest.mark.slow
 def test_gradients_equal_differences(x64):
     first, second = (jnp.asarray(v) for v in pairs(1))
     corners = jnp.asarray(CORNERS)
@@ -120,6 +121,7 @@ def test_masked_equals_absent(x64):
     np.testing.assert_allclose(a.value.homogeneous, b.value.homogeneous, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["same", "line", "random", "nan", "three"])
 def test_degenerate_sets_are_not_ok(dtype, kind):
     first, second = pairs(3)

@@ -53,6 +53,7 @@ def angle(fit, t):
     return np.degrees(np.arccos(np.clip(np.asarray(fit.value.direction.vector) @ t, -1, 1)))
 
 
+@pytest.mark.slow
 def test_as_near_as_magsac(x64):
     ours, theirs = [], []
     K = np.array([[FOCAL, 0, 0], [0, FOCAL, 0], [0, 0, 1]])
@@ -69,6 +70,7 @@ def test_as_near_as_magsac(x64):
     assert np.median(ours) < 1.2 * np.median(theirs) and np.max(ours) < 5.0
 
 
+@pytest.mark.slow
 def test_consistency(x64):
     """Under least squares, from the true pose: five degrees of freedom."""
     first, second, R, t = pairs(3, false=0.0, sigma=0.0)
@@ -88,6 +90,7 @@ def test_consistency(x64):
     assert ok.all() and 4.3 < nees.mean() < 5.7
 
 
+@pytest.mark.slow
 def test_gradients_equal_differences(x64):
     first, second, _, _ = pairs(1)
 
@@ -123,6 +126,7 @@ def degenerate(kind, seed):
     return first / FOCAL, second / FOCAL
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["planar", "rotation", "repeated", "collinear", "noise", "nan", "empty"])
 def test_degenerate_sets(kind):
     """Finite in value and derivative; the benchmark tries ten thousand sets."""

@@ -41,6 +41,7 @@ def drive():
     return rig, simulated.pairs, found
 
 
+@pytest.mark.slow
 def test_every_motion_is_found_without_outliers_among_the_inliers(drive):
     _, pairs, found = drive
     assert found.estimate.ok.all()
@@ -87,6 +88,7 @@ def test_without_information_there_is_no_motion_and_no_nan(drive):
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(eqx.filter(again, eqx.is_inexact_array)))
 
 
+@pytest.mark.slow
 def test_disparity_offset_is_recovered(drive):
     """A constant 0.7 px taken off all disparities comes back from near and far points together."""
     rig, pairs, found = drive

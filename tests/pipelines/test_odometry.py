@@ -39,6 +39,7 @@ def street():
     return sequence, np.asarray(sequence.truth.matrices(), np.float64)
 
 
+@pytest.mark.slow
 def test_drift_on_the_street_is_below_three_thousandths(street):
     sequence, truth = street
     outs = list(odometry.run(sequence, odometry.Config(), sequence.rig))
@@ -118,6 +119,7 @@ def test_images_that_cannot_be_used_are_refused(street):
     refuse("left image has shape .* start anew with init", state, left=frame.left[1:], right=frame.right[1:])
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 def test_kitti_06_drifts_less_than_one_percent(recordings):
     sequence = kitti.read_sequence(recordings / "kitti_odometry/sequences/06", None)
@@ -132,6 +134,7 @@ def test_kitti_06_drifts_less_than_one_percent(recordings):
     assert np.median(errors) < 0.035
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 def test_kitti_01_among_moving_cars(recordings):
     """Rotation within the accuracy of the truth; the clip's disparities are too small, which calibration corrects."""

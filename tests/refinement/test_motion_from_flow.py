@@ -187,6 +187,7 @@ def degenerate(kind, rng):
     return points, flow, depth
 
 
+@pytest.mark.slow
 def test_gradients_and_degenerate_flows(x64, rng):
     """One program for all: what is degenerate is flagged and finite; what is not has the gradient of differences."""
     cases = [degenerate(kind, rng) for kind in ("nan", "one place", "still", "turn", "noisy turn")]

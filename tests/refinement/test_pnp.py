@@ -108,6 +108,7 @@ def summary(camera, points, pixels):
     return jnp.sum(jnp.sin(jnp.arange(1.0, 7.0, dtype=points.dtype)) * value.log())
 
 
+@pytest.mark.slow
 def test_gradients_by_pixels_points_and_intrinsics(x64, rng):
     arguments = view(rng, lens=LENS)
     gradient = eqx.filter_jit(jax.grad(lambda a: summary(*a)))(arguments)
@@ -127,6 +128,7 @@ def test_gradients_by_pixels_points_and_intrinsics(x64, rng):
         assert abs((float(high) - float(low)) / (2 * step) - expected) <= 1e-4 * abs(expected)
 
 
+@pytest.mark.slow
 def test_gradient_in_single_precision(rng):
     with jax.enable_x64(True):
         arguments = view(rng)
@@ -174,6 +176,7 @@ def degenerate(kind, rng, count):
 KINDS = ("collinear", "coincident", "behind", "empty", "two points", "masked nan", "nan", "huge")
 
 
+@pytest.mark.slow
 def test_ten_thousand_degenerate_problems(rng):
     """Values and gradients are finite in every lane, and no lane without an answer says that it has one."""
     parts = [degenerate(kind, rng, 1250) for kind in KINDS]

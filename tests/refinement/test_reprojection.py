@@ -62,6 +62,7 @@ def derivatives(problem, pose):
     return closed, by_rule, jax.hessian(lambda d: cost_along(problem, pose, d))(zero)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "loss"), CASES)
 def test_closed_forms_equal_autodiff(name, loss, x64, rng):
     """The Jacobian anywhere, the Hessian at a minimum."""

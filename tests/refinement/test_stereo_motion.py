@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from jaxloc.poses import SE3
@@ -46,6 +47,7 @@ def motions(previous, current, noise):
     return jax.vmap(lane)(previous, current)
 
 
+@pytest.mark.slow
 def test_motion_is_consistent_and_better_than_one_camera(rng):  # K-86, K-87, T-72
     nees, ok, (errors, plain) = motions(*drives(rng, 400), jnp.asarray(0.5, jnp.float32))
     assert np.all(ok)
@@ -55,6 +57,7 @@ def test_motion_is_consistent_and_better_than_one_camera(rng):  # K-86, K-87, T-
     assert rms < 0.8 * rms_plain
 
 
+@pytest.mark.slow
 def test_motion_without_noise_is_exact(dtype, rng):
     previous, current = (x[0].astype(dtype) for x in drives(rng, 1, noise=0.0))
     found = refine_motion(rig_at(dtype), previous, current, SE3.identity(dtype))
@@ -62,6 +65,7 @@ def test_motion_without_noise_is_exact(dtype, rng):
     np.testing.assert_allclose(found.value.log(), MOTION, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_motion_masked_equals_absent(x64, rng):
     previous, current = (x[0].astype(np.float64) for x in drives(rng, 1))
     masked_current = current.at[50:].set(jnp.nan)
@@ -86,6 +90,7 @@ def test_motion_with_outliers_under_a_robust_kernel(rng):
     np.testing.assert_allclose(found.value.log(), MOTION, atol=0.08)
 
 
+@pytest.mark.slow
 def test_degenerate_motions_are_flagged_and_finite(rng):
     previous, current = (x[0] for x in drives(rng, 1))
     everything = jnp.ones(60, bool)

@@ -52,6 +52,7 @@ def drives():
         return worlds, solve(worlds, jnp.array(True)), solve(worlds, jnp.array(False))
 
 
+@pytest.mark.slow
 def test_pose_is_consistent(drives, x64):
     worlds, (_, history), _ = drives
     distance = jax.vmap(jax.vmap(lambda belief, pose: belief.mahalanobis_squared(pose)))

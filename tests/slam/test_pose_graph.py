@@ -113,6 +113,7 @@ def test_the_jacobian_is_that_of_autodiff(x64, rng, group):
     np.testing.assert_allclose(closed.jacobian, general.jacobian, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_masked_is_absent_and_bad_edges_do_no_harm(rng):
     _, edges, guess = ring(rng)
     fit = pose_graph.optimize(guess, edges)

@@ -62,6 +62,7 @@ def test_covariance_equals_gtsam_in_the_plane(x64, rng):
     assert np.abs(found.covariance - expected).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_covariance_equals_gtsam_in_space(x64, rng):
     poses, data, covariance, prior = graph_setting(SE3, rng)
     found = solve(FunctionProblem(graph, data), jax.vmap(lambda p: p.retract(jnp.full(6, 0.02)))(poses))

@@ -80,6 +80,7 @@ def with_prior(state, data):
     return {"points": (seen - data["target"]).T / data["sigma"], "prior": (state["bias"] - 0.1) / 0.02}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["levenberg_marquardt", "dogleg", "gauss_newton_qr", "levenberg_marquardt_qr"])
 def test_solvers_agree_on_a_pytree_with_two_kernels(name, x64, rng):
     data = noisy_alignment(rng, outliers=0.2)
@@ -124,6 +125,7 @@ def inner(a, b):
     return sum(float(jnp.sum(x * y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOSSES)
 def test_gradient_equals_differences(name, x64, rng):
     data, loss = noisy_alignment(rng, outliers=0.3), LOSSES[name]()
@@ -151,6 +153,7 @@ def test_single_precision_gradient(rng):
         assert error < 1e-4
 
 
+@pytest.mark.slow
 def test_second_derivative_equals_differences_of_the_first(x64, rng):
     data = noisy_alignment(rng, outliers=0.3)
     direction = directions(data, rng)
@@ -205,6 +208,7 @@ def test_initial_value_has_no_derivative(x64, rng):
 TWO_POINTS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [GaussNewton(), LevenbergMarquardt(), Dogleg()], ids=lambda s: type(s).__name__)
 def test_two_points_leave_a_turn_about_their_line(solver):
     dtype = np.float32

@@ -84,6 +84,7 @@ def test_covariance_and_cost_equal_those_of_the_solver(x64, rng):
     assert int(found.num_steps) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [2, 3])
 @pytest.mark.parametrize("with_scale", [False, True])
 def test_gradient_equals_differences(size, with_scale, x64, rng):
@@ -122,6 +123,7 @@ def test_gradient_is_finite_where_singular_values_are_equal(x64):
     np.testing.assert_allclose(gradient.ravel()[5], difference, rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("align", [align_points, align_scaled_points])
 def test_degenerate_sets_are_flagged_and_finite(align, rng):
     source, target = cloud(rng)

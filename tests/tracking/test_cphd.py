@@ -141,6 +141,7 @@ def test_symmetric_functions_are_sums_over_subsets(rng):
     assert bool(jnp.all(jnp.isfinite(slope)))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_spooky_effect():  # T-76
     """Two targets a kilometer apart, one of which is missed."""

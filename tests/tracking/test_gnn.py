@@ -65,6 +65,7 @@ def trackers():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", trackers())
 def test_all_trackers_through_one_driver(name, scene):  # T-65
     truth, measurements, valid = scene
@@ -115,6 +116,7 @@ def test_one_scan_is_scipys_assignment(rng):
         assert float(after.existence[slot]) == pytest.approx(existence, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_modes_inside_tracks():  # T-6
     steady, agile = make_filter(0.001), make_filter(10.0)
     modes = jl.filters.InteractingMultipleModel((steady, agile), jnp.array([[0.95, 0.05], [0.1, 0.9]]))

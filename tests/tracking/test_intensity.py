@@ -185,6 +185,7 @@ def test_spawning_is_a_motion_of_each_component(rng):
 SEEN = np.array([[1.2, 0.3], [5.1, -3.8], [30.0, 30.0], [7.0, 7.0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gate", [None, 0.99])
 def test_births_with_measurements_have_exact_weights(gate):
     birth = jl.tracking.PointBirth(0.2, 1e4, jnp.eye(2), jnp.full(2, 9.0))

@@ -94,6 +94,7 @@ def test_no_measurements_leave_the_state(dtype):
     assert bool(jnp.all(after.existence <= state.existence))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [

@@ -152,7 +152,7 @@ def test_edges_of_the_image_and_of_size(rng):
     assert prepare(small).levels < 4
     with pytest.raises(ValueError, match="does not fit"):
         prepare(small[:10])
-    with pytest.raises(ValueError, match="one shape"):
+    with pytest.raises(ValueError, match="same shape"):
         track(previous, current[1:], near)
     with pytest.raises(ValueError, match="odd"):
         Klt(size=10)

@@ -67,6 +67,7 @@ def pair():
     return image, cut(image, warp), warp
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", [Translation, Euclidean, Similarity, Affine, Homography])
 def test_every_group_finds_its_warp(group):
     image = texture(np.random.default_rng(2))
@@ -76,6 +77,7 @@ def test_every_group_finds_its_warp(group):
     assert bool(fit.ok) and corner_error(fit, warp) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formulation", ALL, ids=lambda f: type(f).__name__)
 def test_formulations_agree(formulation):
     image = texture(np.random.default_rng(3))
@@ -86,6 +88,7 @@ def test_formulations_agree(formulation):
     assert bool(fit.ok) and corner_error(fit, warp) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "descent, bound",
     [
@@ -109,6 +112,7 @@ def test_descents_reach_the_warp(descent, bound, formulation):
     assert corner_error(fit, warp) < bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formulation", [lk.ForwardsCompositional(), lk.ForwardsAdditive()], ids=["composed", "added"])
 def test_newton_has_the_exact_hessian(formulation, x64):
     """Second-order terms against the Hessian of the cost on an image that is known between its pixels."""
@@ -140,6 +144,7 @@ def test_newton_has_the_exact_hessian(formulation, x64):
     assert newton < 0.01 and plain > 0.05
 
 
+@pytest.mark.slow
 def test_exposure_breaks_plain_differences_only(pair):  # K-22
     image, template, warp = pair
     dark = np.float32(0.6 * image + 30)
@@ -177,6 +182,7 @@ def test_masked_pixels_are_absent(pair):
     np.testing.assert_allclose(one.value.matrix(), two.value.matrix(), atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("brightness", [lk.GainBias(), lk.Correlation()], ids=["gain-bias", "correlation"])
 @pytest.mark.parametrize(
     "formulation", [lk.InverseCompositional(), lk.ForwardsCompositional()], ids=["inverse", "forwards"]
@@ -210,6 +216,7 @@ def test_gradient_equals_finite_differences(brightness, formulation, pair, x64):
         assert abs(float(jnp.sum(slopes[index] * way)) - expected) <= 1e-4 * max(1.0, abs(expected))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clean", [False, True], ids=["two noisy images", "clean template"])
 def test_covariance_is_consistent(clean, pair):
     """NEES over 200 seeds of noise inside the 95 % band of its mean."""
@@ -232,6 +239,7 @@ def test_covariance_is_consistent(clean, pair):
     assert 5.5 < float(jnp.mean(values)) < 6.5
 
 
+@pytest.mark.slow
 def test_multi_start_converges_from_far(pair):  # K-24
     image, template, warp = pair
     grid = multi_start.translations_around(
@@ -246,6 +254,7 @@ def test_multi_start_converges_from_far(pair):  # K-24
     assert not bool(alone.ok) and corner_error(alone, warp) > 1
 
 
+@pytest.mark.slow
 def test_batched_and_jitted_like_single(pair):
     image, template, _ = pair
     image, template = jnp.asarray(image, jnp.float32), jnp.asarray(template, jnp.float32)
@@ -293,6 +302,7 @@ def differentiated(image, template, place, loss):
     return fit, slopes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["flat", "edge", "outside", "nan", "start", "noise"])
 @pytest.mark.parametrize("loss", [jl.solvers.Quadratic(), Huber(1.345)], ids=["plain", "robust"])
 def test_non_finite_values_are_flagged(kind, loss, pair):
@@ -315,6 +325,7 @@ def test_single_bad_pixels_do_no_harm():
     assert all(np.all(np.isfinite(slope)) for slope in slopes)
 
 
+@pytest.mark.slow
 def test_pictures_of_any_numbers_and_sizes(pair):
     image, template, warp = pair
     mixed = lk.align(np.uint8(np.clip(image, 0, 255)), np.float32(template), Homography, start())

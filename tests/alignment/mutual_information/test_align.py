@@ -57,6 +57,7 @@ def opencv(image, template, warp):
     return ecc, np.hypot(u - WARPS[warp][0, 2], v - WARPS[warp][1, 2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("warp", WARPS)
 @pytest.mark.parametrize("name", ["astronaut", "gravel"])
 def test_aligns_where_squares_and_ecc_fail(rng, warp, name):  # K-22, R-36
@@ -75,6 +76,7 @@ def test_aligns_where_squares_and_ecc_fail(rng, warp, name):  # K-22, R-36
             assert ecc > 1.0 and squares > 2.0
 
 
+@pytest.mark.slow
 def test_covariance_is_cautious(rng):
     start, truth = Translation(jnp.asarray(START, jnp.float32)), Affine.from_matrix(jnp.float32(WARPS[Affine]))
     many = jax.jit(jax.vmap(lambda *pair: align(*pair, Affine, start)))
@@ -131,6 +133,7 @@ def test_gradient_of_the_measure(rng, x64):
 SMALL = MutualInformation(blurs=(2.0, 0.5), max_steps=60, tolerance=1e-4)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_warp(rng, x64):
     scene = real_scene("astronaut")[:80, :90]
     image, template = (jnp.asarray(x) for x in (255 - scene, scene[12:52, 20:64]))
@@ -141,6 +144,7 @@ def test_gradient_of_the_warp(rng, x64):
     np.testing.assert_allclose(jax.jacfwd(place)(0.0), want, rtol=0.02, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_degenerate_images(rng):
     scene = real_scene("astronaut")[:80, :90].astype(np.float32)
     template = scene[12:52, 20:64].copy()
@@ -172,6 +176,7 @@ def test_degenerate_images(rng):
     np.testing.assert_allclose(found.value.translation, [20, 12], atol=0.05)
 
 
+@pytest.mark.slow
 def test_batch_and_bytes(rng):
     scene = real_scene("astronaut")[:80, :90]
     image, template = (jnp.asarray(np.round(x), jnp.uint8) for x in (255 - scene, scene[12:52, 20:64]))

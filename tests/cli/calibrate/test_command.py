@@ -72,6 +72,7 @@ def test_one_camera(inputs, tmp_path, capsys):
     assert len(rows) == 1 + 6 * 30 and rows[1].startswith("left,view1.png,0,")
 
 
+@pytest.mark.slow
 def test_two_cameras(inputs, tmp_path):
     out = tmp_path / "out"
     assert run(command(inputs, out, "--right", inputs / "right")) == 0

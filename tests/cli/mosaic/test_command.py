@@ -48,6 +48,7 @@ def arguments(inputs, out, **other):
     return [str(word) for word in words]
 
 
+@pytest.mark.slow
 def test_every_file_is_written(drive, inputs, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(arguments(inputs, out)) == 0

@@ -55,6 +55,7 @@ def test_the_drive(museum):
     assert np.median(np.abs(off)) < 0.04
 
 
+@pytest.mark.slow
 def test_a_thousand_particles_track_for_two_hundred_meters(museum):  # they end within 10 cm
     drives = [drive_below(museum, seed, step=0.1) for seed in range(3)]
     drives = jax.tree.map(lambda *leaves: jnp.stack(leaves), *drives)

@@ -93,6 +93,7 @@ def test_sums_along_the_edge_are_sharper_than_upright_ones():
     assert peak[0] > peak[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens, roll", [(None, 0.0), ((-0.2, 0.03, 0.0, 0.0), 0.02)])
 def test_the_sensor_tells_where_borders_cross_rows(x64, lens, roll):
     ground, state = (

@@ -65,6 +65,7 @@ def errors_of(road, template, wrong_pitch, count, seed=3):
     return np.array(errors), np.array(nees), np.array(ok)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong_pitch", [0.0, np.deg2rad(0.5)])
 def test_road_with_marks(template, wrong_pitch):
     errors, nees, ok = errors_of(ROAD, template, wrong_pitch, 24)
@@ -186,6 +187,7 @@ def test_blending_is_a_mean_of_what_is_known():
     np.testing.assert_allclose(ralph.blend(old, new, jnp.array(0.25)).values, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_batch_is_a_loop_and_jit_is_eager(template):
     views = [view_of(picture_of(ROAD, t, travelled=s)) for t, s in zip(*truths(3), strict=True)]
     together = jax.vmap(ralph.estimate, in_axes=(0, None))(jax.tree.map(lambda *v: jnp.stack(v), *views), template)
@@ -195,6 +197,7 @@ def test_batch_is_a_loop_and_jit_is_eager(template):
         np.testing.assert_allclose(together.curvature[index], alone.curvature, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_gradient_by_picture_and_pitch(x64, template):
     """The derivative of a minimum: against a second solution of a changed problem, solved as far as float64 goes."""
     # Between pixels interpolation has kinks: steps of pitch above 1e-6 rad cross some of them.
@@ -223,6 +226,7 @@ def test_gradient_by_picture_and_pitch(x64, template):
         np.testing.assert_allclose(slopes[:, argument], slope, rtol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["blank", "night", "noise", "nan", "unseen"])
 def test_what_shows_no_road_is_not_believed(template, kind):
     rng = np.random.default_rng(0)

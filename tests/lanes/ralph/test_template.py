@@ -51,6 +51,7 @@ def follow(trip, views, adaptation):
     return np.abs(errors), np.array(believed)
 
 
+@pytest.mark.slow
 def test_templates_follow_a_road_that_changes():
     """K-42 to K-44: another surface comes from ahead; a fixed template is lost, others keep the lane to some dm."""
     road = dataclasses.replace(ROAD, shadows=None).followed_by(dataclasses.replace(FOREIGN, shadows=None), 40.0)

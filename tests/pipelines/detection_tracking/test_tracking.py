@@ -43,6 +43,7 @@ def tracked(request, street):
     return track(places, scores, valid, times, config=config)
 
 
+@pytest.mark.slow
 def test_each_car_is_one_track(street, tracked):
     truth = street[0]
     assert np.unique(tracked.ids[tracked.valid]).tolist() == [1, 2]
@@ -116,6 +117,7 @@ def test_no_detections_and_too_many(street):
     assert crowd.num_dropped.sum() > 0 and crowd.valid.sum(axis=1).max() <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gmphd", "jpda", "gnn"])
 def test_steps_give_the_numbers_of_a_run(street, check_resumed, name):
     """Saved after a miss, before the next one."""

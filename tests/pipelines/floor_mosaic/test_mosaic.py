@@ -13,6 +13,7 @@ from jaxloc.poses.planar import relative_poses
 PIXEL = 0.045 / (700.0 * 208 / 640)  # m
 
 
+@pytest.mark.slow
 def test_frame_errors_and_loop_closure(drive, built):
     assert built.ok and built.left_out == () and any(pair.ok and pair.closes for pair in built.pairs)
     for pair in built.pairs:
@@ -52,6 +53,7 @@ def test_the_mosaic_is_the_floor(drive, built):
     assert np.std(gains) < 0.03
 
 
+@pytest.mark.slow
 def test_bad_images_are_left_out_and_named(drive):
     """A blank image, one of another place, one with nan pixels (which is used)."""
     frames = drive.frames[:8].astype(np.float32)
@@ -72,6 +74,7 @@ def test_bad_images_are_left_out_and_named(drive):
     assert built.covariances[2, 0, 0] > 100 * built.covariances[3, 0, 0]
 
 
+@pytest.mark.slow
 def test_a_far_image_has_no_overlap(drive):
     odometry = drive.odometry[:3].copy()
     odometry[2, 0] = 5.0
@@ -98,6 +101,7 @@ def frames_of(drive, count):
     return list(floor_mosaic.split_frames(drive.frames[:count], drive.odometry, covariances=drive.covariances))
 
 
+@pytest.mark.slow
 def test_a_restored_run_gives_the_same_mosaic(drive, check_resumed):
     view = floor_mosaic.make_view(drive.frames, drive.camera.ground, Config())
     outs, state = check_resumed(lambda: floor_mosaic.init(Config(), view), floor_mosaic.step, frames_of(drive, 6), 3)

@@ -43,6 +43,7 @@ def outs(images):
     return list(run(images, CONFIG, camera()))
 
 
+@pytest.mark.slow
 def test_a_drive_is_followed_from_detection_on(trip, outs):
     assert [out.source for out in outs] == ["start"] + ["borders"] * 23 and all(out.ok for out in outs)
     errors = np.array([out.lane for out in outs])[:, :3] - trip.lanes[:, :3]
@@ -73,6 +74,7 @@ def test_the_warning_follows_from_the_lane(outs):
             assert place == pytest.approx(out.crossing_side * (0.5 * out.width - 0.9), abs=1e-2)
 
 
+@pytest.mark.slow
 def test_dark_images_are_bridged_and_the_lane_detected_again(images):
     dark = [Image(np.zeros(SHAPE, np.float32))] * 7
     outs = list(run([*images[:5], *dark, *images[12:16]], CONFIG, camera()))

@@ -19,6 +19,7 @@ def inside(box, uv, room=6.0):
 
 
 # T-4, T-68, T-78: a car that comes towards the camera
+@pytest.mark.slow
 def test_an_oncoming_car_is_tracked_where_it_is():
     street = simulate_street(num_frames=22, seed=0)
     car = street.objects[1]
@@ -37,6 +38,7 @@ def test_an_oncoming_car_is_tracked_where_it_is():
     assert np.linalg.norm(last.state[3:] - truth) < 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 def test_cars_of_a_real_highway(recordings):
     """The lead car in the labeled frames but the first, where nothing has moved yet, and two oncoming cars."""

@@ -2,6 +2,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -55,6 +56,7 @@ def dense_residual(state, data):
     return (rig.project(frames[CAMERA, POINT]) - measured).T / 0.5
 
 
+@pytest.mark.slow
 def test_bundle_equals_dense_solution(x64, rng):
     rig = rig_at()
     _, start, measured = scene(rig, rng)
@@ -125,6 +127,7 @@ def total(bundle):
     return jnp.sum(jnp.sin(bundle.points)) + jnp.sum(bundle.poses.translation[2:] * 3.0)
 
 
+@pytest.mark.slow
 def test_gradients_equal_finite_differences(x64, rng):
     camera = camera_at()
     _, start, measured = scene(camera, rng)

@@ -43,6 +43,7 @@ def joined(tangent):
     return jnp.concatenate([tangent.cameras.ravel(), tangent.points.ravel()])
 
 
+@pytest.mark.slow
 def test_exact_hessian_and_its_solution(x64, rng):
     model = rig_at()
     state, measured = bundle_and_sights(model, rng)

@@ -67,6 +67,7 @@ def finite(tree):
     return all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("intrinsics", "camera"),
     [
@@ -130,6 +131,7 @@ def test_covariance_is_confirmed_by_simulated_calibrations(x64, rng):
     assert low < np.mean(nees) < high
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences(x64, rng):
     corners = noisy(rng, 0.5)
 
@@ -145,6 +147,7 @@ def test_gradients_are_those_of_finite_differences(x64, rng):
         assert float(gradient[place]) == pytest.approx(float(numeric), rel=1e-4, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_masked_is_absent(x64, rng):
     corners = noisy(rng)
     valid = np.ones((NUM, len(BOARD)), bool)
@@ -162,6 +165,7 @@ def test_masked_is_absent(x64, rng):
     np.testing.assert_array_equal(masked.value.T_camera_board.translation[2], 0.0)
 
 
+@pytest.mark.slow
 def test_outliers_are_outvoted(x64, rng):
     corners = noisy(rng, 0.1)
     wrong = corners.at[0, 5].add(8.0).at[3, 20].add(-6.0)
@@ -199,6 +203,7 @@ def test_what_cannot_be_determined(x64, rng):
         Fisheye(9)
 
 
+@pytest.mark.slow
 def test_gradients_of_bad_corners_are_finite(x64):
     bad = jnp.zeros((NUM, len(BOARD), 2)).at[0].set(jnp.nan)
     gradient = jax.grad(lambda c: calibrate(jnp.asarray(BOARD), c, intrinsics=TWO, shape=SHAPE).value.camera.fx)(bad)
@@ -218,6 +223,7 @@ def test_single_precision_is_near(rng):
     assert (difference <= 0.2 * sigmas).all()
 
 
+@pytest.mark.slow
 def test_derivatives_picture_by_picture_are_those_of_the_whole(x64, rng):
     corners = noisy(rng)[:3].at[1].set(jnp.nan)
     views = finite_views(jnp.asarray(BOARD), corners, None)
@@ -234,6 +240,7 @@ def test_derivatives_picture_by_picture_are_those_of_the_whole(x64, rng):
     np.testing.assert_allclose(ours, eqx.filter_jit(Problem.hessian)(*calm), rtol=1e-6, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize(
     ("pattern", "grid"),

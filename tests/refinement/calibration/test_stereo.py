@@ -46,6 +46,7 @@ def numbers(tree):
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
 
 
+@pytest.mark.slow
 def test_exact_corners_and_boards_that_one_camera_sees(x64, rng):
     first, second, left, right, rig = scene(rng)
     first, second = first.at[1].set(jnp.nan), second.at[2].set(jnp.nan)
@@ -58,6 +59,7 @@ def test_exact_corners_and_boards_that_one_camera_sees(x64, rng):
     assert fit.covariance.shape == (26 + 6 * NUM,) * 2 and bool(jnp.all(jnp.diagonal(fit.covariance) >= 0))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_determined(x64, rng):
     first, second, *_ = scene(rng)
     odd = jnp.arange(NUM)[:, None, None] % 2 == 0
@@ -68,6 +70,7 @@ def test_what_cannot_be_determined(x64, rng):
         assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(fit))
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 def test_recordings_against_opencv(recordings, x64):
     """The bars: reprojection error at most 1 % above OpenCV's, parameters within 3 standard deviations."""

@@ -98,6 +98,7 @@ def test_confusion_of_the_bank():  # K-75
     assert np.all(np.diag(matrix) > 0.8) and np.all(matrix - np.diag(np.diag(matrix)) < 0.8)
 
 
+@pytest.mark.slow
 def test_wrong_kinds_and_empty_floors_are_rejected():
     only = eqx.filter_jit(lambda image, kind: find_pallet(image, camera_at(), (kind,)))
     for index, kind in enumerate(TYPES):
@@ -108,6 +109,7 @@ def test_wrong_kinds_and_empty_floors_are_rejected():
         assert not bool(found.ok) and np.all(np.isfinite(found.covariance)) and np.isfinite(found.value.x)
 
 
+@pytest.mark.slow
 def test_gradient_by_the_picture(x64):
     """Along a change of blur and light, in double precision; an empty image has none."""
     camera = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), camera_at())

@@ -179,6 +179,7 @@ def drive(filt, worlds, readings):
     return np.sqrt(np.mean([error**2 for error, _ in found])), max(count for _, count in found), rows
 
 
+@pytest.mark.slow
 def test_looks_and_places_together_do_what_neither_does_alone(worlds, x64):
     """Numbers hidden: a map nearly as good as with them, while looks alone or places alone mix landmarks up."""
     unknown = -np.ones(STEPS, np.int32)

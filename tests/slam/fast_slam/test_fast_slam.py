@@ -82,6 +82,7 @@ def ekf_slam_error(worlds):
     return np.sqrt(np.mean(np.sum(np.asarray(ends.landmarks - worlds.landmarks) ** 2, axis=-1)))
 
 
+@pytest.mark.slow
 def test_maps_are_near_those_of_ekf_slam(laps, x64):
     """100 particles around a loop lose some of what one Gaussian keeps, and no more than that."""
     worlds, answers = laps

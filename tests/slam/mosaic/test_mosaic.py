@@ -251,6 +251,7 @@ def test_one_program_serves_all_poses(drive, rectifier, world):
     assert len(traces) == 1
 
 
+@pytest.mark.slow
 def test_gradients_of_the_tracked_pose(x64, drive):
     """By the image and by the height of the camera, against central differences."""
     ground = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), drive.camera.ground)

@@ -33,6 +33,7 @@ def test_numbers_become_records(given):
     assert model.survival.dtype == jnp.float32 and model.survival.shape == ()
 
 
+@pytest.mark.slow
 def test_targets_out_of_sight_are_not_missed():
     """Where nothing can be detected, nothing is learned of its absence."""
     phd = jl.tracking.GmPhd(make_model(Sight(jnp.array(10.0))), capacity=4)

@@ -40,6 +40,7 @@ def run(*arguments):
     return CliRunner().invoke(app, [str(a) for a in arguments])
 
 
+@pytest.mark.slow
 def test_rows_images_and_report(recording, tmp_path):
     out = tmp_path / "out"
     result = run("track", recording, "--poses", recording / "poses.txt", "--out", out)
