@@ -110,7 +110,7 @@ def _ransac(hypotheses: int, num_points: int, repeats: int) -> Iterator[Metric]:
 
 
 def _poses_of_three(sample: dict) -> Candidates:
-    found = jl.multiview.p3p.p3p(sample["rays"], sample["points"])
+    found = jl.multiview.p3p(sample["rays"], sample["points"])
     return Candidates(found.poses, found.valid)
 
 

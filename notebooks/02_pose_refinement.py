@@ -121,7 +121,7 @@ plt.show()
 
 # %%
 def poses_of_three(sample):
-    found = jl.multiview.p3p.p3p(sample["rays"], sample["points"])
+    found = jl.multiview.p3p(sample["rays"], sample["points"])
     return jl.solvers.Candidates(found.poses, found.valid)
 
 
