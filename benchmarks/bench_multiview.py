@@ -27,7 +27,7 @@ def _p3p(count: int, repeats: int) -> Iterator[Metric]:
     seen = np.einsum("bji,bnj->bni", problems.truth[:, :3, :3], problems.points - problems.truth[:, None, :3, 3])
     rays = seen / np.linalg.norm(seen, axis=-1, keepdims=True)
     arguments = jnp.asarray(rays, jnp.float32), jnp.asarray(problems.points, jnp.float32)
-    run = jax.jit(jax.vmap(jl.multiview.p3p.p3p))
+    run = jax.jit(jax.vmap(jl.multiview.p3p))
     found = run(*arguments)
     error = np.linalg.norm(np.asarray(found.poses.translation) - problems.truth[:, None, :3, 3], axis=-1)
     best = np.where(np.asarray(found.valid), error, np.inf).min(axis=1)

@@ -219,6 +219,7 @@ def test_readme_commands_are_those_of_the_ci():
     assert re.findall(r"^readonly \w+_command='(.*)'$", script, flags=re.MULTILINE) == commands
 
 
+@pytest.mark.slow
 def test_readme_code_runs(capsys):
     names: dict = {}
     for code in readme_blocks("python"):

@@ -106,6 +106,7 @@ def test_bytes_and_shapes(rng):
         phase_correlation.similarity(previous, current, rounds=0)
 
 
+@pytest.mark.slow
 def test_similarity_finds_any_turn(rng):
     skimage_data = pytest.importorskip("skimage.data")
     scene = cv2.imread(str(Path(skimage_data.__file__).with_name("brick.png")), cv2.IMREAD_GRAYSCALE)

@@ -106,6 +106,7 @@ def test_nees_of_the_unscented_image_is_chi_square(x64):
     assert abs(nees.mean() - 2.0) < 4 * 2.0 / np.sqrt(5000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["linear", "unscented", "sampled"])
 def test_gradients_vmap_and_eager(x64, name):
     method = methods(n=16)[name]

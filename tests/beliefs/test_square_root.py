@@ -30,6 +30,7 @@ def test_whiten_and_solve(x64, rng, size):
     assert np.allclose(square_root.solve(root, right[:, 0]), square_root.solve(root, right)[:, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [3, 12])
 def test_singular_covariances_stay_finite(dtype, size):
     @jax.jit
@@ -109,6 +110,7 @@ def test_downdate(x64, rng):
     assert np.allclose(found @ found.T, root @ root.T - np.outer(vector, vector), rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_downdate_never_fails(dtype):
     eye = jnp.eye(3, dtype=dtype)
     for root in (eye, jnp.zeros_like(eye)):

@@ -37,6 +37,7 @@ def test_options_come_from_a_file_or_from_an_earlier_run(pipeline, sequence, tmp
     assert pipeline.used.threshold == 3.0 and pipeline.used.kernel.scale == 0.5
 
 
+@pytest.mark.slow
 def test_options_from_the_command_line_come_last(pipeline, sequence, tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text("threshold: 3\nnum_features: 7\n")

@@ -114,6 +114,7 @@ def test_blank_images(value):
     assert not valid.any() and np.isfinite(slope).all()
 
 
+@pytest.mark.slow
 def test_batch_is_a_loop(photo):
     images = jnp.asarray(np.stack([photo[:96, :96], photo[96:192, 96:192]]), jnp.float32)
     run = lambda image: sift(image, capacity=20)[0].uv  # noqa: E731

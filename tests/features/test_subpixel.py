@@ -69,6 +69,7 @@ def test_stereo_finds_the_column(rng, dtype, options):  # T-10
     np.testing.assert_allclose(error[:, 1], 0, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", METHODS)
 def test_translation_finds_the_point(rng, dtype, options):
     case, truth = motion_case(rng, dtype=dtype)

@@ -75,6 +75,7 @@ def inside(values, dof):
 
 
 # T-57
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [ExtendedKalmanFilter, SigmaPointFilter])
 def test_consistent_on_poses(drives, kind):
     truth, readings = drives
@@ -175,6 +176,7 @@ class Beacons(Sensor):
         return self.variance * jnp.eye(2, dtype=state.dtype)
 
 
+@pytest.mark.slow
 def test_gradients_by_every_array(x64, rng):
     sensor = Beacons(jnp.array([[4.0, 3.0], [-2.0, 5.0]]), jnp.array(0.04))
     model = (ExtendedKalmanFilter(ConstantVelocity(0.3), sensor, iterations=2, loss=Huber()), 0.3 * jnp.eye(4))

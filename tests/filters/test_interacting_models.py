@@ -148,6 +148,7 @@ def test_one_that_is_not_there_and_wrong_shapes(results):
 
 
 # EKF/UKF toolbox: IMM 0.0229; benchmarks have its smoother and the other scenarios.
+@pytest.mark.slow
 def test_published_maneuvers():
     scores = toolbox.maneuvers(100, whole=False)
     assert abs(scores["imm"].mean - 0.0229) < 0.001

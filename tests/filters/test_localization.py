@@ -102,6 +102,7 @@ def test_a_kidnapped_robot_is_found_again(world):
     assert inject[20:].max() > 0.1 and inject[:20].max() < 0.1
 
 
+@pytest.mark.slow
 def test_runs_resume_to_the_same_numbers(world, tracked):
     key = jax.random.key(1)
     state, steps = world.init_near(0, jax.random.key(0)), np.arange(STEPS)

@@ -93,6 +93,7 @@ def test_growth_model_table_of_the_toolbox():  # bootstrap, 1000 particles, 100 
     assert abs(errors.mean() - 10.2) < 0.4
 
 
+@pytest.mark.slow
 def test_growth_model_table_of_arulampalam():  # SIR, 50 particles: 5.54
     errors = growth_errors(2000, 100, 50, 0, 10.0, 1.0, 10.0)
     assert abs(np.sqrt(errors.mean()) - 5.54) < 0.1
@@ -128,6 +129,7 @@ def log_likelihood(a, key, readings, particles, noise=0.25, **options):
     return run(filt, state, None, readings[:, None], valid, key=key)[1].infos.log_likelihood.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -157,6 +159,7 @@ def score_runs(count, particles, seed, **options):
     return np.float64(jax.jit(jax.vmap(slope, in_axes=(None, 0)))(jnp.float32(0.8), keys))
 
 
+@pytest.mark.slow
 def test_gradient_certificate():
     readings = decay_readings(100)
     score = (exact(0.8 + 1e-5, readings) - exact(0.8 - 1e-5, readings)) / 2e-5
@@ -166,16 +169,19 @@ def test_gradient_certificate():
     assert found.std() < 4.5
 
 
+@pytest.mark.slow
 def test_no_gradient_is_lost_in_single_precision():
     assert np.all(np.isfinite(score_runs(1000, 30, 3)))
 
 
+@pytest.mark.slow
 def test_guided_gradient_along_the_particles():
     score = (exact(0.8 + 1e-5, decay_readings(100)) - exact(0.8 - 1e-5, decay_readings(100))) / 2e-5
     found = score_runs(100, 200, 0, proposal=Guided(), pathwise=True)
     assert abs(found.mean() - score) < 3.0 * found.std() / np.sqrt(100) and found.std() < 2.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("resampling", [Soft(), OptimalTransport(iterations=8)], ids=["soft", "transport"])
 def test_biased_gradients_are_finite(resampling):
     readings = jnp.asarray(decay_readings(10), jnp.float32)

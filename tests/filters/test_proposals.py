@@ -77,6 +77,7 @@ class Distance(Sensor):
         return jnp.full((1, 1), 0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "proposal", [Guided(), Auxiliary(), Auxiliary(guided=True)], ids=["guided", "ahead", "adapted"]
 )

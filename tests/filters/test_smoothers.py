@@ -123,6 +123,7 @@ def test_parallel_run_equals_the_sequential_one(results):
         assert np.allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_parallel_run_in_float32_and_its_gradient():
     parts, readings, valid = data(3)
     filt = KalmanFilter(*models([part.astype(np.float32) for part in parts]))

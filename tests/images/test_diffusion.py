@@ -93,6 +93,7 @@ def test_without_edges_it_is_nearly_a_gaussian(x64):
     np.testing.assert_allclose(ours, smooth(spot, 4.0, radius=20), atol=0.1 * float(ours.max()))
 
 
+@pytest.mark.slow
 def test_edges_stay_where_noise_goes(rng):  # T-43
     edge = np.where(np.arange(80) < 40, 60.0, 180.0)[None, :] + 8.0 * rng.normal(size=(60, 80))
     edge = jnp.asarray(edge, jnp.float32)

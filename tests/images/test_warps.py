@@ -51,6 +51,7 @@ def test_group_laws(group, rng, x64):
     assert len(tangent_labels(a)) == group.dof
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS)
 def test_jacobians_equal_autodiff(group, rng, x64):
     warp = group.exp(tangent(rng, group))

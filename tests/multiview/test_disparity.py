@@ -110,6 +110,7 @@ def test_what_only_one_picture_shows_is_not_valid():
     assert found.valid[hidden].mean() < 0.5 * unchecked.valid[hidden].mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["flat", "nan", "unrelated"])
 def test_bad_images(dtype, kind):
     left, right = scene(4.0)

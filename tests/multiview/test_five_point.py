@@ -42,6 +42,7 @@ def misses(found, index, essential):
     return np.where(valid, apart, np.inf).min()
 
 
+@pytest.mark.slow
 def test_the_true_pose_is_among_the_candidates(dtype, batch):
     first, second, R, t = problems()
     found = batch(jnp.asarray(first, dtype), jnp.asarray(second, dtype))

@@ -82,6 +82,7 @@ def test_among_false_correspondences_it_is_as_near_as_magsac(x64):
     assert np.median(ours) < 1.15 * np.median(theirs)
 
 
+@pytest.mark.slow
 def test_consistency(x64):
     """Without false correspondences, under least squares: eight degrees of freedom."""
     true = Homography.from_matrix(jnp.asarray(MATRIX))
@@ -165,6 +166,7 @@ def test_too_few_correspondences_raise():
         estimate_homography(jnp.zeros((3, 2)), jnp.zeros((3, 2)), key=jax.random.key(0))
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 def test_graffiti(recordings):
     """A painted wall from two sides, with the homography of its authors."""

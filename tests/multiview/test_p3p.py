@@ -90,6 +90,7 @@ def test_solutions_equal_poselib_and_opencv(x64, batch):
             assert np.abs(ours - center).max(1).min() < 1e-3
 
 
+@pytest.mark.slow
 def test_degenerate_problems_stay_finite(dtype, batch):
     rays, world, _, _ = problems(8, seed=3)
     cases = np.broadcast_to(world[:1], (8, 3, 3)).copy()

@@ -107,6 +107,7 @@ def test_gradients_equal_differences(scene, rng):
     np.testing.assert_allclose(slopes.reshape(3, 10), differences, rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_bad_geometry_is_not_believed(dtype, rng):
     poses = jax.tree.map(lambda leaf: leaf.astype(dtype), cameras(rng, 5))
     still = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], leaf.shape), poses)

@@ -104,6 +104,7 @@ def test_gradients_equal_differences(x64):
     np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_masked_equals_absent(x64):
     first, second, _, _ = pairs(2)
     hole = second.copy()

@@ -108,6 +108,7 @@ def test_gradients_equal_differences(x64, solver):
             np.testing.assert_allclose(along, difference, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_degenerate_sets_stay_finite(dtype):
     seen, points, _, _ = scenes(5, 2)
     rays = unit(seen)

@@ -66,6 +66,7 @@ def test_errors_show_no_bias(drive):
     assert (np.abs(errors.mean(axis=0)) < 3.5 * errors.std(axis=0) / np.sqrt(len(errors))).all()
 
 
+@pytest.mark.slow
 def test_a_prediction_that_is_far_off_is_overruled_by_samples(drive):
     rig, pairs, found = drive
     far = jax.vmap(lambda t: t @ SE3.exp(jnp.array([1.0, 0.0, -2.0, 0.0, 0.15, 0.0])))(pairs.motion)

@@ -96,6 +96,7 @@ def test_scans_are_selected_by_motion(drive, grid):
     assert np.flatnonzero(updated).tolist() == [0, 4, 5, 9]
 
 
+@pytest.mark.slow
 def test_a_restored_run_gives_the_same_numbers(drive, grid, check_resumed):
     """Across a change of the number of particles, and between scans that are not used."""
     config = dataclasses.replace(CONFIG, num_particles=300, num_particles_global=600, min_translation=0.3, chunk=3)

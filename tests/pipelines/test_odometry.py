@@ -50,6 +50,7 @@ def test_drift_on_the_street_is_below_three_thousandths(street):
     assert (np.diff(traces) > 0).all()
 
 
+@pytest.mark.slow
 def test_older_keyframes_give_the_same_path(street):
     sequence, truth = street
     config = odometry.Config(keyframe_frames=3)
@@ -86,6 +87,7 @@ def test_a_recording_that_stays_dark_still_gives_poses(street):
         odometry.calibrate_disparity(dark, sequence.rig)
 
 
+@pytest.mark.slow
 def test_the_disparity_offset_of_the_street_is_zero(street):
     sequence, _ = street
     offset = odometry.calibrate_disparity([sequence[i] for i in range(8)], sequence.rig)

@@ -93,6 +93,7 @@ def derivatives_of_log(pose):
     return jax.jacfwd(log)(zero), jax.jacrev(log)(zero), jax.jacfwd(jax.jacrev(log))(zero)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.0, 1e-9, np.pi])
 def test_derivatives_are_finite_to_second_order(angle, dtype):
     forward, backward, second = derivatives_of_log(SE3.exp(jnp.asarray([1.0, 2.0, 3.0, *(angle * AXIS)], dtype)))

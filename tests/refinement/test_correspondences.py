@@ -88,6 +88,7 @@ def reference(arrays, kinds, size, x):
     return np.concatenate([o.ravel() for o in out]) / SIGMA
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [2, 3])
 def test_all_kinds_mixed_equal_scipy(size, x64, rng):
     arrays = scene(rng, size)
@@ -109,6 +110,7 @@ def fit(arrays, counts, size, dtype=np.float32):
     return refine(Correspondences(**everything), pose_of(size, dtype, shift=0.05))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [2, 3])
 def test_each_kind_recovers_the_pose(size, rng):
     arrays = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), scene(rng, size, noise=0.0))
@@ -131,6 +133,7 @@ def test_one_pair_has_the_stated_cost_dofs(size, ranks, x64, rng):
     assert np.linalg.matrix_rank(np.asarray(jacobian.jacobian[0][:, :, 0])) == size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [2, 3])
 def test_closed_jacobians_equal_autodiff(size, dtype, rng):
     problem = Mixed(pairs(scene(rng, size), dtype))
@@ -222,6 +225,7 @@ def degenerate(kind, arrays):
     return {k: tuple(arrays[k]) for k in KINDS}, used
 
 
+@pytest.mark.slow
 def test_gradients_and_degenerate_pairs(x64, rng):
     """One program for all: what is degenerate is flagged and finite; what is not has the gradient of differences."""
     kinds = ("parallel lines", "angles alone", "one point", "no length", "nan")

@@ -49,6 +49,7 @@ def from_opencv(rvec, tvec):
     return np.linalg.inv(np.block([[cv2.Rodrigues(rvec)[0], tvec.reshape(3, 1)], [np.zeros((1, 3)), np.ones((1, 1))]]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", [None, LENS], ids=["no lens", "Brown-Conrady"])
 def test_refined_pose_equals_opencv(lens, x64, rng):  # K-56, K-73
     camera, points, pixels = view(rng, lens=lens)
@@ -93,6 +94,7 @@ def test_robust_pose_equals_scipy(x64, rng):
     np.testing.assert_allclose(found.value.matrix(), from_opencv(best.x[:3], best.x[3:]), atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [LevenbergMarquardt(), Dogleg()], ids=lambda s: type(s).__name__)
 def test_damped_solvers_agree(solver, rng):
     camera, points, pixels = view(rng, np.float32)

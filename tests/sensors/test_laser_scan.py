@@ -21,6 +21,7 @@ def test_thinned_scans_keep_their_directions():
         scan.thin(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [LikelihoodField, BeamModel])
 def test_masked_beams_equal_absent_ones_and_empty_scans_have_no_influence(make, make_field):
     sensor = make(make_field(), max_range=6.0)

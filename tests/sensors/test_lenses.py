@@ -44,6 +44,7 @@ def test_distort_equals_opencv(x64, name):  # T-16, K-81
     assert np.abs(got - expected[:, 0]).max() < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LENSES)
 def test_undistort_inverts_distort(dtype, name):  # T-16, K-81
     lens, (x, y) = make(name), grid(dtype)
@@ -133,6 +134,7 @@ def test_points_outside_the_lens_are_flagged_and_finite(dtype, name):
         assert inside.tolist() == [True, False, False, False]
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop_and_jit_equals_eager(dtype):
     lens, (x, y) = make("five"), grid(dtype)
     together = lens.undistort(x, y)[0]

@@ -64,6 +64,7 @@ def test_pose_is_consistent(drives, x64):
     assert np.asarray(history.infos.nis)[counted].mean() == pytest.approx(2.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_landmarks_are_consistent(drives, x64):
     worlds, (ends, _), _ = drives
 
@@ -207,6 +208,7 @@ def test_a_number_beyond_the_map_is_no_reading(x64):
     assert not bool(info.added) and float(info.log_likelihood) == 0.0
 
 
+@pytest.mark.slow
 def test_likelihood_has_exact_gradients(x64):
     world = simulate_landmarks(motion(), jnp.array(DEVIATIONS), key=jax.random.key(3), num_steps=12, num_landmarks=5)
 
@@ -223,6 +225,7 @@ def test_likelihood_has_exact_gradients(x64):
         np.testing.assert_allclose(slopes[i], (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 def test_mrclam_map(recordings, x64):
     log = read_mrclam(recordings / "mrclam1_robot1", 1, truth_start=1248272272.94, delay=0.25).first(1129)

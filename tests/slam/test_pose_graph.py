@@ -138,6 +138,7 @@ def eqx_at(edges, translation):
     return Edges(edges.first, edges.second, moved, edges.covariance, edges.valid)
 
 
+@pytest.mark.slow
 def test_gradient_by_a_measurement(x64, rng):
     _, edges, guess = ring(rng)
 

@@ -40,6 +40,7 @@ def test_single_precision(size, rng):
     np.testing.assert_allclose(inverse, np.linalg.inv(matrix), rtol=2e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [6, 12])
 @pytest.mark.parametrize("kind", ["rank one less", "zero row", "all zero", "nan"])
 def test_deficient_matrices_are_flagged_and_finite(size, kind, dtype, rng):

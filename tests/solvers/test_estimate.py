@@ -47,6 +47,7 @@ def graph_setting(group, rng):
     return poses, data, covariance, prior
 
 
+@pytest.mark.slow
 def test_covariance_equals_gtsam_in_the_plane(x64, rng):
     poses, data, covariance, prior = graph_setting(SE2, rng)
     found = solve(FunctionProblem(graph, data), jax.vmap(lambda p: p.retract(jnp.full(3, 0.02)))(poses))

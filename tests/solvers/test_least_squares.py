@@ -62,6 +62,7 @@ SOLVERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gauss_newton", "levenberg_marquardt", "dogleg_qr"])
 def test_optimum_equals_kabsch_from_far(name, dtype, rng):  # K-48, K-71
     data = noisy_alignment(rng, dtype)
@@ -140,6 +141,7 @@ def test_gradient_equals_differences(name, x64, rng):
     assert abs(difference - float(forward)) <= 1e-7 * abs(float(forward))
 
 
+@pytest.mark.slow
 def test_single_precision_gradient(rng):
     loss = LOSSES["geman_mcclure"]
     with jax.enable_x64(True):
@@ -168,6 +170,7 @@ def test_second_derivative_equals_differences_of_the_first(x64, rng):
     assert abs(float(difference - curvature)) <= 1e-6 * abs(float(curvature))
 
 
+@pytest.mark.slow
 def test_covariance_is_differentiable(x64, rng):
     data = noisy_alignment(rng, outliers=0.3)
     direction = directions(data, rng)
@@ -178,6 +181,7 @@ def test_covariance_is_differentiable(x64, rng):
     assert abs(float(difference - slope)) <= 1e-5 * abs(float(slope))
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop(x64, rng):
     batch = [noisy_alignment(rng, outliers=0.3) for _ in range(4)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *batch)
@@ -190,6 +194,7 @@ def test_vmap_equals_loop(x64, rng):
         np.testing.assert_allclose(gradients["target"][i], gradient["target"], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_masked_equals_absent(x64, rng):
     data = noisy_alignment(rng)
     masked = {**data, "mask": data["mask"].at[20:].set(0.0)}
@@ -243,6 +248,7 @@ def test_new_numbers_compile_nothing(rng):
     assert count > 0 and len(TRACES) == count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["target", "sigma", "initial"])
 def test_numbers_that_are_not_finite(place, rng):
     dtype = np.float32
@@ -267,6 +273,7 @@ def test_numbers_that_are_not_finite(place, rng):
     assert all(not np.any(leaf) for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_degenerate_lanes_leave_the_others_alone(x64, rng):
     good = noisy_alignment(rng)
     line = {**good, "source": good["source"] * jnp.array([[1.0, 0.0, 0.0]]), "target": good["target"] * 0.0}
@@ -321,6 +328,7 @@ def planar(pose, data):
     return (pose.inverse().apply(data["world"]) - data["seen"]).T / 0.1
 
 
+@pytest.mark.slow
 def test_plane_and_jit_equals_eager(x64, rng):
     truth = SE2(1.0, -0.5, 0.7)
     world = jnp.asarray(rng.normal(size=(6, 2)))

@@ -32,6 +32,7 @@ def cloud(rng, size=3, count=9, noise=0.1):
 rigid, scaled = jax.jit(align_points), jax.jit(align_scaled_points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [2, 3])
 def test_equals_singular_values(size, dtype, rng):  # K-48
     source, target = cloud(rng, size)

@@ -107,6 +107,7 @@ def test_update_is_numpys():
         assert expected[0].sum() + expected[1].sum() == pytest.approx(float(info.count), abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_prediction_is_thinned_and_born(rng):
     tracker = make()
@@ -168,6 +169,7 @@ def test_spooky_effect():  # T-76
     assert 0.4 < near(after.mixture, 1000.0) < 0.6 and near(after.mixture, 0.0) > 1.4
 
 
+@pytest.mark.slow
 def test_no_detections_padding_and_nonfinite_values():
     tracker = make(dtype=jnp.float32, rate=1.0)
     mixture = jl.beliefs.Mixture(jnp.array([0.9]), jnp.zeros((1, 4)), jnp.eye(4)[None])

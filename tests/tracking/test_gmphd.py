@@ -96,6 +96,7 @@ def test_no_detections_leave_the_missed(shape):
     assert float(jnp.max(after.mixture.weights)) == pytest.approx(0.1 * 0.95 * 0.9, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_what_finds_no_room_is_counted():
     """Both what merging leaves over, and what was too light to take part in it."""
     state = some_state(make_phd())
@@ -217,6 +218,7 @@ def likelihood(parameters, z, valid):
     return jnp.sum(jl.filters.run(phd, state, None, z, valid)[1].infos.log_likelihood)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_likelihood_has_the_gradient_of_finite_differences():
     _, z, valid = crossing(np.random.default_rng(2), scans=12)
@@ -244,6 +246,7 @@ def test_gradient_is_finite_where_there_is_nothing():
     assert bool(jnp.isfinite(jax.jit(jax.grad(cost))(jnp.array(0.9))))
 
 
+@pytest.mark.slow
 def test_published_scenario():  # T-74
     """Bounds far wider than those of the benchmark, which runs forty seeds."""
     scenario = jl.data.simulate.targets.LinearScenario(clutter_rate=10.0)

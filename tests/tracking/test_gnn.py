@@ -144,6 +144,7 @@ def test_modes_inside_tracks():  # T-6
         jl.tracking.ProbabilisticDataAssociation(make_model(modes))
 
 
+@pytest.mark.slow
 def test_nothing_measured_and_nonfinite_values():
     tracker = jl.tracking.GlobalNearestNeighbor(make_model(), capacity=4)
     prior = jl.beliefs.Mixture(jnp.array([0.99, 0.5]), jnp.zeros((2, 4)), jnp.stack([jnp.eye(4)] * 2))
@@ -165,6 +166,7 @@ def test_full_table_says_so(rng):
     assert int(info.crowded) == 6 and int(jnp.sum(state.valid)) == 2
 
 
+@pytest.mark.slow
 def test_batches_are_loops(scene):
     _, measurements, valid = scene
     tracker = jl.tracking.GlobalNearestNeighbor(make_model(), capacity=16)

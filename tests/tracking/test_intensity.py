@@ -169,6 +169,7 @@ def test_hundred_mixtures_are_numpys(hundred):  # T-75
         assert float(np.sum(evidence.clutter[number])) == pytest.approx(4 - explained, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_spawning_is_a_motion_of_each_component(rng):
     w, m, P = (part[0] for part in random_mixtures(rng, 1, 3))

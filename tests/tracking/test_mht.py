@@ -93,6 +93,7 @@ def identities_kept(tracker, prior, truth, z, valid):
     return int((labels == [0, 1]).all(axis=1).sum())
 
 
+@pytest.mark.slow
 def test_identities_through_a_crossing():
     # Where the targets cross, one is missed three times; nearest neighbors then often give it the other's way.
     times = np.arange(-8.0, 9.0)
@@ -129,6 +130,7 @@ def test_answers_are_of_one_hypothesis(rng):
         assert np.all(np.asarray(at.existence()) <= 1.0)
 
 
+@pytest.mark.slow
 def test_nothing_measured_and_full_tables(rng):
     tracker = make_tracker(leaves=4, tracks=3)
     state = tracker.init(no_targets())

@@ -84,6 +84,7 @@ def test_update_has_the_moments_of_the_mixture(x64):
     assert float(info.log_likelihood) == pytest.approx(likelihood, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_no_measurements_leave_the_state(dtype):
     tracker = make_tracker()
     tracker = jax.tree.map(lambda leaf: leaf.astype(dtype), tracker)

@@ -170,7 +170,7 @@ class Guided(Proposal):
     resamples_with_measurement = False
 
     def init_noise(self, values: Any) -> MotionNoise:
-        """A placeholder marked as used."""
+        """Placeholder noise, marked as used."""
         return _unused_noise(values)
 
     def draw(self, motion: Motion, values: Any, control: Any, *, key: Key[Array, ""]) -> Sampled:
@@ -205,7 +205,7 @@ class Auxiliary(Proposal):
     resamples_with_measurement = True
 
     def init_noise(self, values: Any) -> MotionNoise:
-        """A placeholder marked as used."""
+        """Placeholder noise, marked as used."""
         return _unused_noise(values)
 
     def draw(self, motion: Motion, values: Any, control: Any, *, key: Key[Array, ""]) -> Sampled:

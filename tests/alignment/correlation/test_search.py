@@ -102,6 +102,7 @@ def test_local_variance_survives_bright_images(rng):
     assert float(got[10, 30]) > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("score", SCORES)
 def test_search_finds_the_place(rng, dtype, score):  # K-23, K-26
     gain, bias = {SumOfSquares: (1.0, 0.0), NormalizedCorrelation: (0.7, 0.0), ZeroMeanCorrelation: (0.6, 30.0)}[
@@ -120,6 +121,7 @@ def test_parabola_is_within_a_tenth(rng):  # K-26
         np.testing.assert_allclose(peaks.uv[0], np.array(CORNER) + [right, down], atol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("score", SCORES)
 def test_covariance_is_calibrated(rng, score):
     image, template = case(rng, gain=0.8 if not isinstance(score, SumOfSquares) else 1.0)
@@ -174,6 +176,7 @@ def test_flat_surfaces_have_no_sharp_peak():
     assert not bool(jnp.any(find_peaks(jnp.full((8, 9), jnp.nan), count=2).valid))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("score", SCORES)
 def test_derivatives(rng, x64, score):
     image, template = case(rng, np.float64)
@@ -201,6 +204,7 @@ def broken(rng):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("score", SCORES)
 def test_degenerate_images(rng, score):
     gradient = eqx.filter_jit(

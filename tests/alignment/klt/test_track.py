@@ -92,6 +92,7 @@ def test_covariance_is_calibrated(rng):
     assert len(squared) > 480 and 0.5 < np.mean(squared) < chi2.ppf(0.995, 2 * len(squared)) / (2 * len(squared))
 
 
+@pytest.mark.slow
 def test_guess_and_way_back(rng):
     inputs, truth = case(rng)
     far = [inputs[0], jnp.roll(inputs[1], 30, axis=1), inputs[2]]
@@ -121,6 +122,7 @@ def test_regression_is_the_least_squares_fit(rng, x64):
     np.testing.assert_allclose(step[:, 0], want[:2] / want[2], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_degenerate_points_are_flagged_and_finite(rng):
     (previous, current, uv), truth = case(rng)
     previous = previous.at[:60, :60].set(90.0)
@@ -159,6 +161,7 @@ def test_edges_of_the_image_and_of_size(rng):
     assert track(previous, current, jnp.zeros((0, 2))).points.shape == (0, 2)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_the_solution(rng, x64):
     (previous, current, uv), _ = case(rng, 0.9, 5.0, 1.0, dtype=np.float64)
     weights = jnp.asarray(rng.normal(size=(N, 2)))

@@ -156,6 +156,7 @@ def test_exposure_breaks_plain_differences_only(pair):  # K-22
     assert corner_error(plain, warp) > 0.3
 
 
+@pytest.mark.slow
 def test_outliers_lose_their_pull(pair):
     image, template, warp = pair
     hidden = np.float32(template).copy()
@@ -165,6 +166,7 @@ def test_outliers_lose_their_pull(pair):
     assert bool(robust.ok) and corner_error(robust, warp) < 0.05 < corner_error(plain, warp)
 
 
+@pytest.mark.slow
 def test_masked_pixels_are_absent(pair):
     image, template, warp = pair
     weights = np.ones((SIZE, SIZE), np.float32)
@@ -314,6 +316,7 @@ def test_non_finite_values_are_flagged(kind, loss, pair):
         assert int(fit.status) == int(Status.RANK_DEFICIENT)
 
 
+@pytest.mark.slow
 def test_single_bad_pixels_do_no_harm():
     matrix = truth(Affine)
     image = texture(np.random.default_rng(7))
@@ -341,6 +344,7 @@ def test_pictures_of_any_numbers_and_sizes(pair):
         lk.align(np.float32(image), np.float32(template), Homography, start(), method=method)
 
 
+@pytest.mark.slow
 def test_new_numbers_do_not_compile_anew(pair):
     image, template, _ = pair
     traces = []
@@ -355,6 +359,7 @@ def test_new_numbers_do_not_compile_anew(pair):
     assert len(traces) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 def test_baker_and_matthews_table():  # section C.1 of the inventory; all sigmas and 1000 runs are in the benchmark
     scene, offsets = baker_matthews.recorded("takeo"), baker_matthews.offsets(200, 3)
@@ -362,6 +367,7 @@ def test_baker_and_matthews_table():  # section C.1 of the inventory; all sigmas
     assert abs(share - 90.8) < 5  # two standard deviations of 200 runs
 
 
+@pytest.mark.slow
 def test_ecc_equals_opencv(pair):
     image, template, _ = pair
     matrix = np.array([[1, 0, PLACE[0]], [0, 1, PLACE[1]]], np.float32)

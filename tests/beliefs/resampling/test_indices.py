@@ -68,6 +68,7 @@ def test_systematic_equals_searchsorted(x64, rng):
     assert np.mean(indices != expected) < 0.005 and np.abs(indices - expected).max() <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCHEMES)
 def test_nonfinite_weights_and_counts(name):
     scheme = jax.jit(SCHEMES[name], static_argnums=2)

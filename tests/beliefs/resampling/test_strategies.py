@@ -9,6 +9,7 @@ from jaxloc.beliefs import Particles, resampling
 from jaxloc.beliefs.resampling.strategies import Multinomial, OptimalTransport, Residual, Soft, Stratified, Systematic
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "strategy", [Systematic(), Stratified(), Multinomial(), Residual(), Soft(), OptimalTransport(iterations=10)]
 )

@@ -51,6 +51,7 @@ def read(path):
     return header, np.array([[float(word) for word in row.split(",")] for row in rows])
 
 
+@pytest.mark.slow
 def test_a_video(trip, inputs, tmp_path, capsys):
     out = tmp_path / "out"
     arguments = [

@@ -40,6 +40,7 @@ def inputs(drive, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_every_file_is_written(drive, inputs, tmp_path, capsys):
     out = tmp_path / "out"
     start = [f"{value:.4f}" for value in drive.truth[0]]

@@ -47,6 +47,7 @@ def test_odometry_writes_every_file(pipeline, sequence, tmp_path, capsys):
     assert config["config"] == {"num_features": 300, "threshold": 2.0, "kernel": {"scale": 1.5}}
 
 
+@pytest.mark.slow
 def test_the_demo_reports_on_a_synthetic_street(pipeline, tmp_path):
     out = tmp_path / "demo"
     assert run(["demo", "--frames", "6", "--seed", "3", "--out", str(out)]) == 0

@@ -72,6 +72,7 @@ def test_a_thousand_particles_track_for_two_hundred_meters(museum):  # R-14: the
     assert np.median(found) < 0.06 and np.median(found[:, -1]) < 0.06 and np.all(found[:, -1] < 0.1)
 
 
+@pytest.mark.slow
 def test_forty_thousand_particles_find_the_robot(museum):  # within 126 updates, from anywhere
     drive = drive_below(museum, 2, distance=75.6, step=0.6)
     assert drive.brightness.shape == (126,)

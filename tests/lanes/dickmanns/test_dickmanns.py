@@ -138,6 +138,7 @@ def start():
     return ExtendedKalmanFilter(LaneMotion(), BorderSensor(camera(), *[jnp.zeros(1)] * 4)).init(prior())
 
 
+@pytest.mark.slow
 def test_the_filter_follows_a_drive():
     trip, state, errors, z = drive(Road(), camera(), 16, course=Course(interval=0.1), shape=SHAPE), start(), [], []
     for index in range(len(trip)):

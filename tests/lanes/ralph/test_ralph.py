@@ -76,6 +76,7 @@ def test_road_with_marks(template, wrong_pitch):
     assert 0.6 < np.median(nees) < 8.0
 
 
+@pytest.mark.slow
 def test_road_without_marks(plain_template):
     errors, _, ok = errors_of(ROAD.without_marks(), plain_template, 0.0, 16)
     assert ok.mean() >= 0.9
@@ -142,6 +143,7 @@ def test_match_is_pearsons_correlation():
     assert float(found.offset) == pytest.approx(0.7, abs=0.06)
 
 
+@pytest.mark.slow
 def test_a_profile_that_repeats_itself_is_ambiguous():
     """K-40: the confidence of a periodic profile is none, that of a single mark is high."""
     left = np.linspace(4.0, -4.0, 81)
@@ -157,6 +159,7 @@ def test_a_profile_that_repeats_itself_is_ambiguous():
     assert bool(state.ambiguous) and not bool(state.ok)
 
 
+@pytest.mark.slow
 def test_a_bank_names_the_road(template):
     bank = jax.tree.map(lambda *leaves: jnp.stack(leaves), capture_of(FOREIGN), template)
     state = ralph.estimate(view_of(picture_of(ROAD, (0.3, 0.01, 5e-4), travelled=300.0)), bank)

@@ -101,6 +101,7 @@ def test_images_that_are_no_sequence_are_processed_alone():
     np.testing.assert_allclose([out.lane[0] for out in outs], [0.5, -0.5], atol=0.05)
 
 
+@pytest.mark.slow
 def test_the_template_is_tracked_where_paint_ends():
     painted = Road(shadows=None)
     road = painted.followed_by(painted.without_marks(), 90.0, 1.0)

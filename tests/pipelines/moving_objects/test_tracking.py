@@ -59,6 +59,7 @@ def test_cars_of_a_real_highway(recordings):
     assert sum(bool(frames) for frames in hits.values()) >= 3
 
 
+@pytest.mark.slow
 def test_given_poses_and_dark_frames():
     street = simulate_street(num_frames=6, seed=0)
     frames = [street[i] for i in range(6)]
@@ -73,6 +74,7 @@ def test_given_poses_and_dark_frames():
                 np.testing.assert_allclose(out.odometry.pose.matrix(), pose, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [False, True])
 def test_a_restored_run_gives_the_same_numbers(check_resumed, known):
     street = simulate_street(num_frames=6, seed=0)

@@ -78,6 +78,7 @@ def test_bundle_equals_dense_solution(x64, rng):
     np.testing.assert_allclose(one.information @ one.covariance, np.eye(6), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_robust_bundle_is_a_minimum_of_the_written_cost(x64, rng):
     rig = rig_at()
     _, start, measured = scene(rig, rng)
@@ -154,6 +155,7 @@ def test_gradients_equal_finite_differences(x64, rng):
         np.testing.assert_allclose(jnp.linalg.norm(slope), (ends[0] - ends[1]) / (2 * step), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_same_under_jit_and_vmap_and_no_retrace(x64, rng):
     rig = rig_at()
     _, start, measured = scene(rig, rng)
@@ -197,6 +199,7 @@ def test_order_of_observations_does_not_matter(x64, rng):
     np.testing.assert_allclose(shuffled.cost, plain.cost, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_dtype_is_kept(dtype, rng):
     rig = rig_at(dtype)
     truth, start, measured = scene(rig, rng, dtype, noise=0.0)

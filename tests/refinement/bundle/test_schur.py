@@ -146,6 +146,7 @@ def spoiled(case, state, measured):
     return points, places, measured, sigma, valid
 
 
+@pytest.mark.slow
 def test_bad_bundles_are_flagged_and_finite(x64, rng):
     camera = camera_at()
     state, measured = bundle_and_sights(camera, rng)

@@ -92,6 +92,7 @@ def test_exact_corners_give_the_exact_camera(x64, intrinsics, camera):
     assert set(held) == set(intrinsics.names()) - set(intrinsics.free()) - moving
 
 
+@pytest.mark.slow
 def test_parameters_and_sigmas_are_those_of_opencv(x64, rng):
     corners = noisy(rng)
     fit = calibrate(jnp.asarray(BOARD), corners, intrinsics=TWO, shape=SHAPE)
@@ -116,6 +117,7 @@ def test_parameters_and_sigmas_are_those_of_opencv(x64, rng):
     assert 2 * float(fit.cost) == pytest.approx(2 * NUM * len(BOARD) - 8 - 6 * NUM, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_covariance_is_confirmed_by_simulated_calibrations(x64, rng):
     """NEES of the camera over 100 calibrations of other noise, sigma known: inside the chi-square band."""
     trials, sigma = 100, 0.2
@@ -210,6 +212,7 @@ def test_gradients_of_bad_corners_are_finite(x64):
     np.testing.assert_array_equal(gradient, 0.0)
 
 
+@pytest.mark.slow
 def test_single_precision_is_near(rng):
     corners, board = np.asarray(noisy(rng), np.float32), BOARD.astype(np.float32)
     fit = calibrate(jnp.asarray(board), jnp.asarray(corners), intrinsics=TWO, shape=SHAPE)

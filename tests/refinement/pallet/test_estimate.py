@@ -50,6 +50,7 @@ def errors(found, pose):
     return np.hypot(float(value.x) - pose[0], float(value.y) - pose[1]), np.degrees(abs(float(value.theta) - pose[2]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", range(3))
 def test_pose_and_kind_at_two_meters(index):  # K-14, K-75
     rng = np.random.default_rng(index)
@@ -61,6 +62,7 @@ def test_pose_and_kind_at_two_meters(index):  # K-14, K-75
         assert away < 0.01 and turned < 0.5
 
 
+@pytest.mark.slow
 def test_lens_pitch_and_shading(rng):
     camera = camera_at(0.6, np.radians(12.0), BrownConrady((-0.2, 0.05, 0.0, 0.0)))
     pose = np.array([2.0, -0.1, 0.2])
@@ -77,6 +79,7 @@ def test_ratio_of_found_edges_is_constant_over_range():  # K-74
     np.testing.assert_allclose(ratios, float(TYPES[0].ratio()), rtol=0.01)
 
 
+@pytest.mark.slow
 def test_covariance_is_consistent():
     squared = []
     for seed in range(24):

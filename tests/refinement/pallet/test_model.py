@@ -133,6 +133,7 @@ def test_gradients_equal_finite_differences(x64, rng):
         assert abs((high - low) / (2 * step) - expected) <= 1e-4 * abs(expected)
 
 
+@pytest.mark.slow
 def test_bad_edges_are_flagged_and_finite():
     good = seen(dtype=np.float32)
     cases = jnp.stack(

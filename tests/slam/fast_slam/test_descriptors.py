@@ -246,6 +246,7 @@ def test_a_number_is_taken_at_its_word(x64):
     assert set(info.landmark.tolist()) == {2}
 
 
+@pytest.mark.slow
 def test_bad_numbers_change_nothing(dtype):
     filt = DescriptorFastSlam(slam(10, capacity=2), Appearance(0.5), length=2)
     state, key = filt.init(start()), jax.random.key(0)
@@ -259,6 +260,7 @@ def test_bad_numbers_change_nothing(dtype):
         assert float(info.log_likelihood) == 0.0 and bool(info.ok) and set(info.landmark.tolist()) == {-1}
 
 
+@pytest.mark.slow
 def test_the_likelihood_has_a_gradient(x64):
     """By noise, descriptors and their deviation; also where a reading is bad."""
 

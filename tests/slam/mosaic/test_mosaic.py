@@ -144,6 +144,7 @@ def test_registration_is_exact_to_a_twentieth_of_a_pixel(drive, patches):
     assert float(ratio) == pytest.approx(drive.gains[4] / drive.gains[5], rel=0.03)
 
 
+@pytest.mark.slow
 def test_squares_find_what_derivatives_do_not(drive, patches):
     truth = SE2(*relative_poses(drive.poses[0][None], drive.poses[1][None])[0])
     guess = truth @ SE2(12 * PIXEL, -9 * PIXEL, 0.02)

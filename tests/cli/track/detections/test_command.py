@@ -62,6 +62,7 @@ def table(path):
     return np.array([[float(word or "nan") for word in line.split(",")] for line in lines[1:]])
 
 
+@pytest.mark.slow
 def test_cars_in_the_world(inputs, tmp_path, capsys):
     out = tmp_path / "out"
     options = ["--poses", inputs / "poses.txt", "--calib", inputs / "calib.txt", "--truth", inputs / "labels.txt"]
