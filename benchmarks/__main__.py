@@ -8,6 +8,8 @@ import time
 from importlib import import_module
 from pathlib import Path
 
+import jax
+
 from benchmarks.metric import REPOSITORY, Metric, device
 
 ROOMS = tuple(sorted(path.stem.removeprefix("bench_") for path in Path(__file__).parent.glob("bench_*.py")))
@@ -21,6 +23,8 @@ def measure(room: str, smoke: bool) -> list[Metric]:
         print(f"{metric.key:<52} {metric.value:>12.5g} {metric.unit}", flush=True)
         metrics.append(metric)
     print(f"# {room}: {time.perf_counter() - started:.0f} s", flush=True)
+    # Each program holds memory maps, of which a process may have 65530: all rooms together need more.
+    jax.clear_caches()
     return metrics
 
 
