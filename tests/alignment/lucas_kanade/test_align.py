@@ -344,7 +344,6 @@ def test_pictures_of_any_numbers_and_sizes(pair):
         lk.align(np.float32(image), np.float32(template), Homography, start(), method=method)
 
 
-@pytest.mark.slow
 def test_new_numbers_do_not_compile_anew(pair):
     image, template, _ = pair
     traces = []
