@@ -86,7 +86,7 @@ HOSTILE = [
     ("a: &a [x]\nb: [*a, *a]", r"aliases are not allowed"),
     ("a: &a [x, x]\n" + "".join(f"a{i}: &a{i} [*a, *a]\n" for i in range(30)), r"aliases are not allowed"),
     ("a: &a [*a]", r"aliases are not allowed"),
-    (" " * (1 << 20) + "a: 1", r"too large for a file of options"),
+    (" " * (1 << 20) + "a: 1", r"too large for such a file"),
     (b"threshold: \xff\xfe", r"is no text file"),
     (b"\x00\x00", r"no valid YAML"),
 ]

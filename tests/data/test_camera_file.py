@@ -128,7 +128,7 @@ def test_precision_is_that_of_jax(tmp_path):
         ("rows: 5\n   cols: 1", "rows: 6\n   cols: 1", "distortion_coefficients has 5 numbers"),
         ("height_m: 1.2", "height_m: 0", "height_m is 0, must be positive"),
         ("height_m: 1.2", "height_m: high", "height_m is 'high', must be a finite number"),
-        ("pitch_rad: 2e-2", "pitch_rad: .nan", "pitch_rad is 'nan'"),
+        ("pitch_rad: 2e-2", "pitch_rad: .nan", "pitch_rad is nan"),
         ("pitch_rad: 2e-2", "pitch_rad: 45", "pitch_rad is 45, must lie between"),
         ("image_width: 640", "image_width: -1", "image_width is -1, must be a positive whole number"),
         ("image_width: 640\n", "", "image_width is None"),
@@ -184,3 +184,28 @@ def test_real_files(recordings):
     assert read.shape == (480, 640) and round(float(read.camera.fx), 2) == 535.92
     read = read_camera(recordings / "stereo_calib_opencv" / "intrinsics.yml")
     assert round(float(read.camera.cx), 3) == 335.686 and read.camera.lens.coefficients.shape == (5,)
+
+
+BASE = (
+    "camera_matrix: {{rows: 3, cols: 3, data: [5e+02, 0, '320', 0, 500., 240, 0, 0, 1]}}\ndistortion_coefficients: {}\n"
+)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
+def test_lenses_of_all_of_opencvs_models(tmp_path, count):
+    path = tmp_path / "a.yaml"
+    values = [-0.3, 0.1, 1e-3, 0.0, 0.0, 0.2, 0.0, 0.0][:count] + [0.0] * (count - 8)
+    path.write_text(BASE.format(f"{{rows: 1, cols: {count}, data: {values}}}"))
+    camera = read_camera(path).camera
+    points = np.array([[0.2, -0.1, 1.0], [-0.3, 0.2, 1.0]])
+    want, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.asarray(camera.matrix(), float), np.array(values))
+    np.testing.assert_allclose(camera.project(jnp.asarray(points, float)), want[:, 0], atol=1e-3)
+
+
+@pytest.mark.parametrize(("place", "name"), [(8, "s1"), (11, "s4"), (12, "tau_x"), (13, "tau_y")])
+def test_lenses_that_are_not_supported_are_named(tmp_path, place, name):
+    values = [0.0] * 14
+    values[place] = 0.01
+    (tmp_path / "a.yaml").write_text(BASE.format(values))
+    with pytest.raises(DataError, match=f"{name} = 0.01: thin prisms and tilted sensors"):
+        read_camera(tmp_path / "a.yaml")

@@ -107,14 +107,13 @@ def test_damaged_files_are_refused(tmp_path, pack):
         carmen.read_log(tmp_path)
 
 
-def test_a_small_file_cannot_fill_the_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(carmen, "_LARGEST_LOG", 1 << 20)
+def test_a_small_file_cannot_fill_the_memory(tmp_path):
     packed = io.BytesIO()
     with gzip.open(packed, "wb") as file:
-        file.write(b"ODOM 0\n" * (1 << 20))
+        file.write(b"ODOM 0\n" * (1 << 21))
     path = tmp_path / "bomb.log.gz"
     path.write_bytes(packed.getvalue())
-    with pytest.raises(DataError, match="is larger than 1 MiB"):
+    with pytest.raises(DataError, match="holds more than 8 MiB"):
         carmen.read_log(path)
 
 
@@ -136,3 +135,29 @@ def test_a_real_log_is_that_of_the_keyframes(recordings):
     np.testing.assert_allclose(log.mount, [-0.04, 0, 0], atol=1e-6)
     corrected = carmen.read_log(folder / "fr079_corrected.log.gz")
     np.testing.assert_allclose(corrected.corrected, keyframes["ref"], atol=1e-9)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-32"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_the_first_message_is_read_in_any_encoding(tmp_path, encoding, end):
+    lines = ["PARAM robot_front_laser_max 8.0", *(flaser(float(i), 0.5 * i).strip() for i in range(4))]
+    for first in (0, 1):
+        (tmp_path / "a.log").write_bytes(end.join(lines[first:]).encode(encoding))
+        log = carmen.read_log(tmp_path / "a.log")
+        assert len(log) == 4 and log.max_range == (81.0 if first else 8.0)
+
+
+def test_ranges_that_cannot_be(tmp_path):
+    path = tmp_path / "a.log"
+    path.write_text("PARAM robot_front_laser_max -5 0 h 0\n" + LOG)
+    with pytest.raises(DataError, match="line 1: greatest range -5 must be positive"):
+        carmen.read_log(path)
+    path.write_text("".join(f"FLASER 1 {word} 0 0 0 0 0 0 {i} h 0\n" for i, word in enumerate(("1", "1e39", "nan"))))
+    log = carmen.read_log(path)
+    assert log.ranges.shape == (3, 1) and log.angle_increment > 0 and np.isinf(log.ranges[1, 0])
+
+
+def test_how_the_laser_is_mounted_is_said(tmp_path):
+    path = tmp_path / "a.log"
+    path.write_text(LOG)
+    assert carmen.read_log(path).mounting == "The laser is mounted at (-0.1, 0) m, 0 degrees."

@@ -55,8 +55,9 @@ def test_packed_file_is_read(folder):
         ("camera_poses", POSE, "row 2 names camera 4, which has no pose"),
         ("stereo_factors", "0 7 100 90 nan 1 2 3", "not finite"),
         ("stereo_factors", "0 7 100 90 x 1 2 3", "no number"),
+        ("stereo_factors", "0 1e17 100 90 50 1 2 3", "number of a point"),
         ("stereo_factors", "0 7 90 90 50 1 2 3", "no positive disparity"),
-        ("stereo_factors", "0 1e300 100 90 50 1 2 3", "number of a point"),
+        ("stereo_factors", "0 1e300 100 90 50 1 2 3", "too large"),
     ],
 )
 def test_bad_files_are_named(folder, file, text, message):

@@ -77,3 +77,16 @@ def test_bad_input_names_the_file(folder, tmp_path):
     assert refuse(folder, "no image that can be read").name == "f11.png"
     (folder / "f11.png").write_bytes(b"")
     refuse(folder / "f11.png", "no image that can be read")
+
+
+def test_names_with_odd_digits_are_sorted(folder):
+    cv2.imwrite(str(folder / "f².png"), picture(1))
+    assert len(list(open_recording(folder))) == 4
+
+
+def test_mixed_orientations_are_named(folder, tmp_path):
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\1\1\x12\0\3\0\0\0\1\0\3\0\0\0\0\0\0"
+    data = cv2.imencode(".jpg", picture(5))[1].tobytes()
+    (folder / "f101.jpg").write_bytes(data[:2] + b"\xff\xe1\0" + bytes([len(exif) + 2]) + exif + data[2:])
+    with pytest.raises(DataError, match="f101.jpg: has the EXIF orientation 3, but the first image 1"):
+        list(open_recording(folder))

@@ -95,3 +95,61 @@ def test_missing_and_damaged_files(folder):
     (folder / "m.png").write_bytes(b"")
     with pytest.raises(DataError, match="is no image"):
         ros_map.read_map(folder / "m.yaml")
+
+
+@pytest.mark.parametrize(
+    ("line", "resolution", "x"),
+    [
+        ("origin: [-1e+03, 2.5, 0]", 0.1, -1000.0),
+        ("origin: ['-1.5', \"2.5\", 1e-05]", 0.1, -1.5),
+        ("origin: [.5, 5., 0]", 0.1, 0.5),
+        ("origin: [+010, 2, 0]", 0.1, 10.0),
+        ("resolution: 5e-2", 0.05, -1.0),
+        ("resolution: '0.05'", 0.05, -1.0),
+        ("resolution: 5E-2 # m", 0.05, -1.0),
+        ("negate: '0'", 0.1, -1.0),
+        ("negate: false", 0.1, -1.0),
+        ("occupied_thresh: 6.5e-1", 0.1, -1.0),
+    ],
+)
+def test_numbers_as_ros_writes_them(folder, line, resolution, x):
+    kept = [old for old in YAML.splitlines() if old.split(":")[0] != line.split(":")[0]]
+    (folder / "m.yaml").write_bytes("\r\n".join([*kept, line]).encode("utf-16"))
+    grid = ros_map.read_map(folder / "m.yaml")
+    assert float(grid.resolution) == pytest.approx(resolution) and float(grid.origin.x) == pytest.approx(x)
+
+
+@pytest.mark.parametrize(
+    "word", ["1_000", "true", "0x10", "1:30", "2001-01-01", "1e39", "-nan", "1e400", "9" * 400, "~", "''"]
+)
+def test_words_that_are_no_numbers(folder, word):
+    for old in ("-1.0", "0.1\n"):
+        (folder / "m.yaml").write_text(YAML.replace(old, word + "\n" * old.endswith("\n"), 1))
+        with pytest.raises(DataError, match="must be a finite number") as error:
+            ros_map.read_map(folder / "m.yaml")
+        assert len(str(error.value)) < 200 + len(str(folder))
+
+
+def write_alpha(folder, mode, negate=0):
+    """Opaque black and white, transparent black and white, half transparent black."""
+    gray, alpha = np.array([[0, 254, 0, 254, 0]], np.uint8), np.array([[255, 255, 0, 0, 128]], np.uint8)
+    cv2.imwrite(str(folder / "m.png"), np.dstack([gray, gray, gray, alpha]))
+    (folder / "m.yaml").write_text(YAML.replace("negate: 0", f"negate: {negate}") + f"mode: {mode}\n")
+    grid = ros_map.read_map(folder / "m.yaml")
+    return np.asarray(grid.occupied)[0].tolist(), np.asarray(grid.free)[0].tolist()
+
+
+def test_opacity_is_that_of_the_map_server(folder):
+    """nav2's map_io.cpp: what is not opaque is unknown in scale, opacity is a color of trinary, and raw ignores it."""
+    black, white = [True, False, False, False, False], [False, True, False, False, False]
+    assert write_alpha(folder, "scale") == (black, white)
+    assert write_alpha(folder, "scale", negate=1) == (white, black)
+    # Means of all four: 63.75 (occupied), 254.25 (free), 0 (occupied), 190.5 and 32.
+    assert write_alpha(folder, "trinary") == ([True, False, True, False, True], white)
+    assert write_alpha(folder, "raw") == ([False] * 5, [True, False, True, False, True])
+
+
+def test_images_of_16_bits(folder):
+    cv2.imwrite(str(folder / "m.png"), np.array([[0, 65535, 52685]], np.uint16))
+    grid = ros_map.read_map(folder / "m.yaml")
+    np.testing.assert_allclose(grid.probability, [[1.0, 0.0, 1 - 52685 / 65535]], atol=1e-6)

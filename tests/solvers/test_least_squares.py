@@ -1,12 +1,12 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import pytest
 
 from jaxloc.poses import SE2, SE3, local
 from jaxloc.solvers import (
+    QR,
     Cauchy,
     Dogleg,
     FunctionProblem,
@@ -56,9 +56,9 @@ SOLVERS = {
     "gauss_newton": GaussNewton(),
     "levenberg_marquardt": LevenbergMarquardt(),
     "dogleg": Dogleg(),
-    "gauss_newton_qr": GaussNewton(linear_solver=lx.QR()),
-    "levenberg_marquardt_qr": LevenbergMarquardt(linear_solver=lx.QR()),
-    "dogleg_qr": Dogleg(linear_solver=lx.QR()),
+    "gauss_newton_qr": GaussNewton(linear_solver=QR()),
+    "levenberg_marquardt_qr": LevenbergMarquardt(linear_solver=QR()),
+    "dogleg_qr": Dogleg(linear_solver=QR()),
 }
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc.alignment.correlation.peaks import find_peaks
 from jaxloc.images.interpolation import Bicubic, sample
@@ -234,7 +235,7 @@ def _newton(gradient: Float[Array, "2"], hessian: Float[Array, "2 2"]) -> tuple[
     """Newton step to a maximum, and whether the Hessian is negative definite."""
     determinant = hessian[0, 0] * hessian[1, 1] - hessian[0, 1] ** 2
     curved = (hessian[0, 0] < 0) & (determinant > 1e-3 * hessian[0, 0] * hessian[1, 1]) & (determinant > 0)
-    inverse = jnp.linalg.inv(jnp.where(curved, hessian, -jnp.eye(2, dtype=hessian.dtype)))
+    inverse = _linalg.inverse(jnp.where(curved, hessian, -jnp.eye(2, dtype=hessian.dtype)))
     return jnp.where(curved, -matmul(inverse, gradient), 0.0), curved
 
 
@@ -252,10 +253,10 @@ def _scatter(factors: Array, uv: Array, hessian: Array, ok: Array) -> tuple[Arra
     window = (35.0 / 18.0) ** 2
     meat = 2.0 * window * jnp.stack([jnp.stack([along[0], both]), jnp.stack([both, along[1]])])
     eye = jnp.eye(2, dtype=uv.dtype)
-    inverse = jnp.linalg.inv(jnp.where(ok, lax.stop_gradient(hessian), eye))
+    inverse = _linalg.inverse(jnp.where(ok, lax.stop_gradient(hessian), eye))
     covariance = jnp.where(ok, matmul(inverse, matmul(meat, inverse)) + 1e-4 * eye, eye)
     covariance = lax.stop_gradient(covariance)
-    return covariance, jnp.where(ok, jnp.linalg.inv(covariance), 0.0 * eye)
+    return covariance, jnp.where(ok, _linalg.inverse(covariance), 0.0 * eye)
 
 
 def _about_center(rotation_scale: Float[Array, "2"], shape: tuple[int, int]) -> Similarity:
@@ -298,7 +299,7 @@ def _joint(turn: _Peak, shift: _Peak, sampling: LogPolar, shape: tuple[int, int]
     centered = jnp.block([[shift.covariance, zero], [zero, rotated]])
     adjoint = Similarity.of(Translation(_center(shape, zero.dtype))).adjoint()
     covariance = matmul(adjoint, matmul(centered, adjoint.T))
-    return covariance, jnp.linalg.inv(covariance)
+    return covariance, _linalg.inverse(covariance)
 
 
 def _estimate(value: Any, covariance: Array, information: Array, height: Array, ok: Array, finite: Array) -> Estimate:

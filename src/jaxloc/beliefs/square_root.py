@@ -219,7 +219,7 @@ def _gram_schmidt_stacked(stack: Array) -> Array:
 
 
 def _by_library(rows: Array) -> Array:
-    upper: Any = jnp.linalg.qr(rows.T, mode="r")
+    upper: Any = _linalg.triangular_factor(rows.T)
     signed = upper * jnp.where(jnp.diagonal(upper) < 0.0, -1.0, 1.0)[:, None]
     missing = max(rows.shape[0] - rows.shape[1], 0)
     return jnp.pad(signed, ((0, missing), (0, 0))).T

@@ -9,10 +9,13 @@ import sys
 __all__ = ["main", "run"]
 
 _BAD_INPUT, _INTERRUPTED = 2, 130
+_FEWEST_THREADS = 8
 
 
 def main() -> None:
     """Runs the command line and leaves the process with its exit code."""
+    # With as few threads as cores, batched calls of LAPACK can wait for each other (docs/lapack_deadlock.md).
+    os.environ.setdefault("PJRT_NPROC", str(max(_FEWEST_THREADS, os.cpu_count() or 1)))
     code = run(sys.argv[1:])
     sys.stdout.flush()
     sys.exit(code)

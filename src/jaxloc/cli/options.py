@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxloc.cli.yaml_file import load_yaml, parse_yaml, read_yaml
 from jaxloc.data import DataError
+from jaxloc.data.io.yaml_file import load_yaml, parse_yaml, read_yaml
 
 TYPE = "type"
 

@@ -7,7 +7,8 @@
     image_width: 1280
     image_height: 720
     camera_matrix: !!opencv-matrix           3x3; or M1 of a stereo rig
-    distortion_coefficients: !!opencv-matrix 4, 5 or 8 (k1 k2 p1 p2 k3 k4 k5 k6); or D1 of a stereo rig
+    distortion_coefficients: !!opencv-matrix 4, 5 or 8 (k1 k2 p1 p2 k3 k4 k5 k6), or 12 or 14 that end in
+                                             zeros; or D1 of a stereo rig
     distortion_model: fisheye                where the lens is one: 4 coefficients
     height_m: 1.2                            of the camera over the ground; positive pitch looks down, positive roll
     pitch_rad: 0.02                          turns the right side of the camera down
@@ -27,8 +28,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxloc.data.io.errors import DataError
-from jaxloc.data.io.text import read_text
+from jaxloc.data.io.text import is_positive
 from jaxloc.data.io.writing import write_file
+from jaxloc.data.io.yaml_file import describe, read_entries, to_number, to_whole
 from jaxloc.sensors import BrownConrady, KannalaBrandt, Pinhole
 
 _MATRIX_KEYS = ("camera_matrix", "M1", "M")
@@ -37,6 +39,7 @@ _FISHEYE = ("fisheye", "equidistant", "kannala_brandt")
 _BROWN = ("plumb_bob", "rational_polynomial", "brown_conrady", "radtan")
 _MOST_PIXELS = 1_000_000
 _LENS_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_UNSUPPORTED = ("s1", "s2", "s3", "s4", "tau_x", "tau_y")
 
 
 class CameraFile(eqx.Module):
@@ -104,13 +107,13 @@ def read_camera(path: Path | str) -> CameraFile:
         ImportError: when pyyaml is not installed.
     """
     path = Path(path)
-    entries = _read_entries(path)
+    entries = read_entries(path, "camera file")
     matrix = _array(path, entries, _MATRIX_KEYS)
     if matrix is None:
         raise DataError(path, f"has no {_MATRIX_KEYS[0]}: it must be a camera file of OpenCV's calibration")
     names, covariance = _covariance(path, entries)
     height = _number(path, entries, "height_m")
-    if height is not None and height <= 0.0:
+    if height is not None and not is_positive(height):
         raise DataError(path, f"height_m is {height:g}, must be positive")
     return CameraFile(
         camera=_camera(path, entries, matrix),
@@ -198,29 +201,6 @@ def _coefficients(lens: Any) -> Any:
     return lens.coefficients
 
 
-def _read_entries(path: Path) -> dict[str, Any]:
-    try:
-        import yaml
-    except ImportError as error:
-        raise ImportError('camera files need pyyaml: pip install "jaxloc[cli]"') from error
-
-    class Loader(yaml.SafeLoader):
-        """Knows the matrices of OpenCV: mappings with rows, cols and data."""
-
-    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, True))
-    text = read_text(path)
-    if text.startswith("%YAML"):
-        # OpenCV writes the version with a colon, which is no YAML.
-        text = text.partition("\n")[2]
-    try:
-        entries = yaml.load(text, Loader)  # noqa: S506
-    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
-        raise DataError(path, f"no valid YAML: {' '.join(str(error).split())[:200]}") from None
-    if not isinstance(entries, dict):
-        raise DataError(path, "is no camera file: it must hold camera_matrix and distortion_coefficients")
-    return entries
-
-
 def _array(path: Path, entries: dict[str, Any], keys: tuple[str, ...]) -> Float64[np.ndarray, "r c"] | None:
     """The matrix under the first of the keys that is there."""
     key = next((key for key in keys if entries.get(key) is not None), None)
@@ -231,25 +211,24 @@ def _array(path: Path, entries: dict[str, Any], keys: tuple[str, ...]) -> Float6
         value = {"rows": 1, "cols": len(value), "data": value}
     if not isinstance(value, dict) or not {"rows", "cols", "data"} <= value.keys():
         raise DataError(path, f"{key} is no matrix: it must have rows, cols and data")
-    rows, columns, data = value["rows"], value["cols"], value["data"]
-    whole = type(rows) is int and type(columns) is int and min(rows, columns) > 0
-    if not whole or not isinstance(data, list) or rows * columns != len(data):
-        count = len(data) if isinstance(data, list) else 0
-        raise DataError(path, f"{key} has {count} numbers, but rows: {rows!r:.20} and cols: {columns!r:.20}")
-    try:
-        numbers = np.array([float(number) for number in data])
-    except (TypeError, ValueError, OverflowError):
-        raise DataError(path, f"{key} holds something that is no number") from None
-    if not np.isfinite(numbers).all():
+    rows, columns, data = to_whole(value["rows"]) or 0, to_whole(value["cols"]) or 0, value["data"]
+    if min(rows, columns) < 1 or not isinstance(data, list) or rows * columns != len(data):
+        count, sizes = len(data) if isinstance(data, list) else 0, (describe(value["rows"]), describe(value["cols"]))
+        raise DataError(path, f"{key} has {count} numbers, but rows: {sizes[0]} and cols: {sizes[1]}")
+    numbers = [to_number(number) for number in data]
+    if None in numbers:
+        raise DataError(path, f"{key} holds something that is no number")
+    array = np.array(numbers, dtype=np.float64)
+    if not (np.abs(array) < 1e30).all():
         raise DataError(path, f"{key} holds a number that is not finite")
-    return numbers.reshape(rows, columns)
+    return array.reshape(rows, columns)
 
 
 def _camera(path: Path, entries: dict[str, Any], matrix: np.ndarray) -> Pinhole:
     if matrix.shape != (3, 3):
         raise DataError(path, f"camera_matrix is {matrix.shape[0]}x{matrix.shape[1]}, must be 3x3")
     fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
-    if not (fx > 0.0 and fy > 0.0):
+    if not (is_positive(fx) and is_positive(fy)):
         raise DataError(path, f"camera_matrix has focal lengths {fx:g} and {fy:g}, must be positive")
     if matrix[2].tolist() != [0.0, 0.0, 1.0] or matrix[1, 0] != 0.0:
         raise DataError(path, "camera_matrix must have the rows (fx skew cx), (0 fy cy), (0 0 1)")
@@ -262,14 +241,18 @@ def _lens(path: Path, entries: dict[str, Any]) -> BrownConrady | KannalaBrandt |
         raise DataError(path, f"has no {_LENS_KEYS[0]}: without a lens, give five zeros")
     model = entries.get("distortion_model", _FISHEYE[0] if entries.get("fisheye_model") == 1 else _BROWN[0])
     if model not in (*_FISHEYE, *_BROWN):
-        raise DataError(path, f"distortion_model is {str(model)[:40]!r}, must be {_FISHEYE[0]} or {_BROWN[0]}")
+        raise DataError(path, f"distortion_model is {describe(model)}, must be {_FISHEYE[0]} or {_BROWN[0]}")
     fisheye = model in _FISHEYE
-    allowed = (4,) if fisheye else (4, 5, 8)
+    allowed = (4,) if fisheye else (4, 5, 8, 12, 14)
     if 1 not in values.shape or values.size not in allowed:
         counts = " or ".join(str(count) for count in allowed)
         shape = f"{values.shape[0]}x{values.shape[1]}"
         raise DataError(path, f"distortion_coefficients is {shape}, must be a row or column of {counts} numbers")
     coefficients = tuple(values.ravel().tolist())
+    if any(coefficients[8:]):
+        name, value = next(pair for pair in zip(_UNSUPPORTED, coefficients[8:], strict=False) if pair[1])
+        raise DataError(path, f"has a lens with {name} = {value:g}: thin prisms and tilted sensors are not supported")
+    coefficients = coefficients[:8]
     if fisheye:
         return KannalaBrandt(coefficients)
     return BrownConrady(coefficients) if any(coefficients) else None
@@ -280,23 +263,19 @@ def _shape(path: Path, entries: dict[str, Any]) -> tuple[int, int] | None:
     if sizes == [None, None]:
         return None
     for key, size in zip(("image_height", "image_width"), sizes, strict=True):
-        if type(size) is not int or not 0 < size <= _MOST_PIXELS:
-            raise DataError(path, f"{key} is {str(size)[:40]}, must be a positive whole number")
-    return sizes[0], sizes[1]  # pyright: ignore[reportReturnType]
+        if not 0 < (to_whole(size) or 0) <= _MOST_PIXELS:
+            raise DataError(path, f"{key} is {describe(size)}, must be a positive whole number")
+    return to_whole(sizes[0]) or 0, to_whole(sizes[1]) or 0
 
 
 def _number(path: Path, entries: dict[str, Any], key: str) -> float | None:
     value = entries.get(key)
     if value is None:
         return None
-    if isinstance(value, str):
-        try:
-            value = float(value)  # YAML takes 1e-3 for a word
-        except ValueError:
-            pass
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise DataError(path, f"{key} is {str(value)[:40]!r}, must be a finite number")
-    return float(value)
+    number = to_number(value)
+    if number is None or not abs(number) < 1e30:
+        raise DataError(path, f"{key} is {describe(value)}, must be a finite number")
+    return number
 
 
 def _angle(path: Path, entries: dict[str, Any], key: str) -> float | None:
@@ -313,4 +292,6 @@ def _covariance(path: Path, entries: dict[str, Any]) -> tuple[tuple[str, ...], n
     if not isinstance(names, list) or covariance.shape != (len(names), len(names)):
         shape = f"{covariance.shape[0]}x{covariance.shape[1]}"
         raise DataError(path, f"parameter_covariance is {shape}, but parameter_names must name every row")
-    return tuple(str(name) for name in names), covariance
+    if not all(isinstance(name, str) for name in names):
+        raise DataError(path, "parameter_names must be words")
+    return tuple(names), covariance

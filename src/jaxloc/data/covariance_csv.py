@@ -48,7 +48,7 @@ def read_covariances(path: Path | str) -> Float64[np.ndarray, "n 6 6"]:
     Raises:
         DataError: when the file is missing or malformed.
     """
-    lines = [(number, line) for number, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
+    lines = [(number, line) for number, line in enumerate(read_text(path).split("\n"), start=1) if line.strip()]
     lines = [(number, line) for number, line in lines if not line.startswith("#")]
     if not lines or not lines[0][1].startswith("frame,"):
         raise DataError(path, "has no header: its first column must be named frame")

@@ -9,8 +9,6 @@
 Each may be packed, with ``.gz`` behind its name.
 """
 
-import gzip
-import zlib
 from pathlib import Path
 
 import equinox as eqx
@@ -20,13 +18,11 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxloc.data.io.errors import DataError
-from jaxloc.data.io.text import check_rotations, parse_numbers, read_text
+from jaxloc.data.io.files import is_folder
+from jaxloc.data.io.text import check_rotations, is_positive, read_rows, whole_numbers
 from jaxloc.poses import SE3
 from jaxloc.refinement.bundle import Bundle, Observations
 from jaxloc.sensors import Pinhole, StereoRig
-
-# A packed file may hold at most this much text: a small one can unpack to more than the memory.
-_LARGEST = 256 * 2**20
 
 
 class StereoBundle(eqx.Module):
@@ -61,13 +57,13 @@ def read_stereo_factors(folder: Path | str, name: str = "00s") -> StereoBundle:
         DataError: when a file is missing or malformed, or the files do not fit each other.
     """
     folder = Path(folder)
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise DataError(folder, "no such folder")
     rig = _read_rig(_find(folder, f"VO_calibration{name}.txt"))
     cameras, matrices = _read_cameras(_find(folder, f"VO_camera_poses{name}.txt"))
     path = _find(folder, f"VO_stereo_factors{name}.txt")
     rows = _read_rows(path, 8)
-    camera, point = _whole_numbers(path, rows[:, 0], "camera"), _whole_numbers(path, rows[:, 1], "point")
+    camera, point = whole_numbers(path, rows[:, 0], "camera"), whole_numbers(path, rows[:, 1], "point")
     unknown = np.flatnonzero(~np.isin(camera, cameras))
     if unknown.size:
         raise DataError(path, f"row {unknown[0] + 1} names camera {camera[unknown[0]]}, which has no pose")
@@ -93,7 +89,7 @@ def _read_rig(path: Path) -> StereoRig:
     if len(rows) != 1:
         raise DataError(path, f"has {len(rows)} rows, needs one: fx fy skew cx cy baseline")
     fx, fy, skew, cx, cy, baseline = (float(value) for value in rows[0])
-    if not (fx > 0 and fy > 0 and baseline > 0):
+    if not (is_positive(fx) and is_positive(fy) and is_positive(baseline)):
         raise DataError(path, f"focal lengths {fx:g}, {fy:g} px and baseline {baseline:g} m must be positive")
     return StereoRig(Pinhole(fx, fy, cx, cy, skew), baseline)
 
@@ -105,7 +101,7 @@ def _read_cameras(path: Path) -> tuple[Int64[np.ndarray, " c"], Float64[np.ndarr
     wrong = np.flatnonzero(np.abs(matrices[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1) > 1e-9)
     if wrong.size:
         raise DataError(path, f"row {wrong[0] + 1} is no pose: its last four numbers are not 0 0 0 1")
-    numbers = _whole_numbers(path, rows[:, 0], "camera")
+    numbers = whole_numbers(path, rows[:, 0], "camera")
     cameras, order = np.unique(numbers, return_index=True)
     if len(cameras) != len(numbers):
         raise DataError(path, "has two poses of one camera")
@@ -113,30 +109,7 @@ def _read_cameras(path: Path) -> tuple[Int64[np.ndarray, " c"], Float64[np.ndarr
 
 
 def _read_rows(path: Path, count: int) -> Float64[np.ndarray, "n count"]:
-    lines = (_unpack(path) if path.suffix == ".gz" else read_text(path)).splitlines()
-    rows = [parse_numbers(path, i, line.split(), count) for i, line in enumerate(lines, start=1) if line.strip()]
-    if not rows:
+    rows = read_rows(path, count)
+    if not len(rows):
         raise DataError(path, "is empty")
-    return np.array(rows, dtype=np.float64)
-
-
-def _unpack(path: Path) -> str:
-    try:
-        with gzip.open(path, "rb") as file:
-            content = file.read(_LARGEST + 1)
-        if len(content) > _LARGEST:
-            raise DataError(path, f"unpacks to more than {_LARGEST // 2**20} MiB")
-        return content.decode("utf-8-sig")
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise DataError(path, "is no gzip file, or a damaged one") from error
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise DataError(path, "is no text file") from error
-
-
-def _whole_numbers(path: Path, values: Float64[np.ndarray, " n"], what: str) -> Int64[np.ndarray, " n"]:
-    wrong = np.flatnonzero((values != np.round(values)) | (np.abs(values) > 2**53))
-    if wrong.size:
-        raise DataError(path, f"row {wrong[0] + 1} has {values[wrong[0]]:g} as the number of a {what}")
-    return values.astype(np.int64)
+    return rows

@@ -18,8 +18,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.files import is_folder
 from jaxloc.data.io.png import read_image, read_size, verify_image
-from jaxloc.data.io.text import check_increasing, check_rotations, parse_numbers, read_rows, read_text
+from jaxloc.data.io.text import check_increasing, check_rotations, is_positive, parse_numbers, read_rows, read_text
 from jaxloc.data.io.writing import write_file
 from jaxloc.data.stereo_sequence import StereoFrame
 from jaxloc.poses import Trajectory
@@ -75,7 +76,7 @@ def read_sequence(folder: Path | str, poses: Path | str | None = None) -> KittiS
         DataError: with one line that names the file or folder that is missing or wrong.
     """
     folder = Path(folder)
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise DataError(folder, "no such folder")
     first, second = _camera_numbers(folder)
     left, right = (_list_images(folder / f"image_{number}") for number in (first, second))
@@ -97,7 +98,7 @@ def _camera_numbers(folder: Path) -> tuple[int, int]:
 
 
 def _list_images(folder: Path) -> list[Path]:
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise DataError(folder, "no such folder")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".png")
     if not paths:
@@ -145,20 +146,20 @@ def read_rig(path: Path | str, *, left: int = 0, right: int = 1) -> StereoRig:
             raise DataError(path, f"has no line P{number}:")
     first, second = matrices[f"P{left}"], matrices[f"P{right}"]
     fx, fy, cx, cy = first[0, 0], first[1, 1], first[0, 2], first[1, 2]
-    if not (fx > 0 and fy > 0):
+    if not (is_positive(fx) and is_positive(fy)):
         raise DataError(path, f"P{left}: focal lengths are {fx:g} and {fy:g} px, must be positive")
     expected = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     if not (np.allclose(first[:, :3], expected, atol=1e-6) and np.allclose(second[:, :3], expected, atol=1e-3)):
         raise DataError(path, f"P{left}: and P{right}: are not those of a rectified pair ([fx 0 cx; 0 fy cy; 0 0 1])")
     baseline = (first[0, 3] - second[0, 3]) / fx
-    if not baseline > 0:
+    if not is_positive(baseline):
         raise DataError(path, f"the baseline from P{left}: and P{right}: is {baseline:g} m, must be positive")
     return StereoRig(Pinhole(*(float(value) for value in (fx, fy, cx, cy))), float(baseline))
 
 
 def _read_projections(path: Path | str) -> dict[str, Float64[np.ndarray, "3 4"]]:
     matrices = {}
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path).split("\n"), start=1):
         name, colon, rest = line.partition(":")
         if colon and name.strip() in ("P0", "P1", "P2", "P3"):
             values = parse_numbers(path, number, rest.split(), 12)

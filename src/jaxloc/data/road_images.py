@@ -4,7 +4,6 @@ Host code: frames are decoded on demand.
 """
 
 import os
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,9 +15,10 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.files import exists, natural_order, read_bytes
+from jaxloc.data.io.images import SUFFIXES, check_header, check_pixels, decode_color
 from jaxloc.features.opencv.backend import load
 
-_IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 _VIDEOS = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv"})
 
 
@@ -51,6 +51,7 @@ class LaneRecording(eqx.Module):
         rate: frames a second of a video; None for images.
         shape: rows and columns.
         count: frames; as declared by a video, which may be more than can be decoded.
+        orientation: EXIF orientation of the images, which are turned by it.
     """
 
     path: Path
@@ -58,6 +59,7 @@ class LaneRecording(eqx.Module):
     rate: float | None
     shape: tuple[int, int]
     count: int
+    orientation: int = 1
 
     def __len__(self) -> int:
         return self.count
@@ -73,7 +75,10 @@ class LaneRecording(eqx.Module):
         return (self._image_frame(index, path) for index, path in enumerate(self.files))
 
     def _image_frame(self, index: int, path: Path) -> LaneFrame:
-        color = _read_image(path)
+        color, orientation = _read_image(path)
+        if orientation != self.orientation:
+            ways = f"has the EXIF orientation {orientation}, but the first image {self.orientation}"
+            raise DataError(path, f"{ways}: one camera cannot have both; turn the images or remove the tags")
         if color.shape[:2] != self.shape:
             raise DataError(path, f"is {_size(color.shape)}, but the first image is {_size(self.shape)}")
         return LaneFrame(index, path.name, None, _gray(color), color)
@@ -113,44 +118,33 @@ def open_recording(path: Path | str) -> LaneRecording:
         (['9.png', '10.png'], (4, 6))
     """
     path = Path(path)
-    if not path.exists():
+    if not exists(path):
         raise DataError(path, "no such file or folder")
     if path.is_file() and path.suffix.lower() in _VIDEOS:
         return _probe_video(path)
     files = _image_files(path) if path.is_dir() else (path,)
     if not files:
         raise DataError(path, "has no images: png, jpg, bmp, tif, pgm, ppm and webp are read")
-    shape = _read_image(files[0]).shape[:2]
-    return LaneRecording(path, files, None, shape, len(files))
+    color, orientation = _read_image(files[0])
+    return LaneRecording(path, files, None, color.shape[:2], len(files), orientation)
+
+
+def _read_image(path: Path) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
+    """Colors, and the EXIF orientation by which they are turned."""
+    data = read_bytes(path, missing="no such image")
+    return decode_color(path, data), check_header(path, data).orientation
 
 
 def _image_files(folder: Path) -> tuple[Path, ...]:
-    found = [path for path in folder.iterdir() if path.suffix.lower() in _IMAGES and path.is_file()]
-    return tuple(sorted(found, key=lambda path: _natural(path.name)))
-
-
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Numbers in a name count as numbers."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
-
-
-def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    cv2 = load()
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror}") from error
-    with _quiet(cv2):
-        color = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    if color is None:
-        raise DataError(path, "is no image that can be read")
-    return color
+    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()]
+    return tuple(sorted(found, key=natural_order))
 
 
 def _probe_video(path: Path) -> LaneRecording:
     cv2 = load()
     with _open_video(path) as video:
+        sides = [video.get(prop) for prop in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        check_pixels(path, int(sides[0] * sides[1]), path.stat().st_size)
         found, color = video.read()
         if not found:
             raise DataError(path, "is a video of which no frame can be decoded")
@@ -186,7 +180,10 @@ def _quiet(cv2: ModuleType) -> Iterator[None]:
 
 
 def _gray(color: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    return 0.5 * (color[..., 1].astype(np.float32) + color[..., 2])
+    total = color[..., 1].astype(np.float32)  # in place: large images are large
+    total += color[..., 2]
+    total *= 0.5
+    return total
 
 
 def _size(shape: tuple[int, ...]) -> str:

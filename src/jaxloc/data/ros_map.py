@@ -8,26 +8,24 @@
     negate: 0                 1 where white is occupied
     occupied_thresh: 0.65
     free_thresh: 0.196
-    mode: trinary             or scale (both: dark is occupied), or raw (percent, and what is above is unknown)
+    mode: trinary             or scale (both: dark is occupied; transparent cells of scale are unknown),
+                              or raw (percent, and what is above is unknown)
 """
 
-import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Num
 
 from jaxloc.data.io.errors import DataError
-from jaxloc.data.io.text import read_text
+from jaxloc.data.io.images import read_stored
+from jaxloc.data.io.text import is_positive
 from jaxloc.data.io.writing import write_file
+from jaxloc.data.io.yaml_file import describe, read_entries, to_number
 from jaxloc.poses import SE2
 from jaxloc.sensors import OccupancyMap
-
-_MOST_CELLS = 100_000_000
-_UNKNOWN = 0.5
 
 
 def read_map(path: Path | str) -> OccupancyMap:
@@ -44,9 +42,9 @@ def read_map(path: Path | str) -> OccupancyMap:
         ImportError: when pyyaml is not installed.
     """
     path = Path(path)
-    entries = _read_yaml(path)
+    entries = read_entries(path, "map")
     resolution = _number(path, "resolution", entries.get("resolution"))
-    if resolution <= 0.0:
+    if not is_positive(resolution):
         raise DataError(path, f"resolution is {resolution:g}, must be positive")
     origin = _origin(path, entries.get("origin"))
     occupied = _number(path, "occupied_thresh", entries.get("occupied_thresh", 0.65))
@@ -83,61 +81,55 @@ def write_map(path: Path | str, grid: OccupancyMap) -> None:
     write_file(path, "\n".join(lines))
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        import yaml
-    except ImportError as error:
-        raise ImportError('maps need pyyaml: pip install "jaxloc[cli]"') from error
-    try:
-        entries = yaml.safe_load(read_text(path))
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(path, f"no valid YAML: {' '.join(str(error).split())[:200]}") from None
-    if not isinstance(entries, dict):
-        raise DataError(path, "is no map: it must hold image, resolution and origin")
-    return entries
-
-
 def _number(path: Path, name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise DataError(path, f"{name} is {value!r}, must be a finite number")
-    return float(value)
+    number = to_number(value)
+    if number is None or not abs(number) < 1e30:
+        raise DataError(path, f"{name} is {describe(value)}, must be a finite number")
+    return number
 
 
 def _origin(path: Path, value: Any) -> list[float]:
     if not isinstance(value, list) or len(value) not in (2, 3):
-        raise DataError(path, f"origin is {value!r}, must be [x, y, heading]")
+        raise DataError(path, f"origin is {describe(value)}, must be [x, y, heading]")
     numbers = [_number(path, "origin", item) for item in value]
     return numbers if len(numbers) == 3 else [*numbers, 0.0]
 
 
+def _negate(path: Path, value: Any) -> bool:
+    if isinstance(value, bool):
+        return value
+    if to_number(value) not in (0.0, 1.0):
+        raise DataError(path, f"negate is {describe(value)}, must be 0 or 1")
+    return to_number(value) == 1.0
+
+
 def _probability(path: Path, entries: dict[str, Any], occupied: float, free: float) -> Float32[np.ndarray, "h w"]:
+    """As nav2's map server computes it (``map_io.cpp``, ``loadMapFromFile``)."""
     name, mode = entries.get("image"), entries.get("mode", "trinary")
     if not isinstance(name, str) or not name:
         raise DataError(path, "has no image")
     if mode not in ("trinary", "scale", "raw"):
-        raise DataError(path, f"mode is {mode!r}, must be trinary, scale or raw")
-    if entries.get("negate", 0) not in (0, 1):
-        raise DataError(path, f"negate is {entries['negate']!r}, must be 0 or 1")
-    values = _read_image(path.parent / name)
+        raise DataError(path, f"mode is {describe(mode)}, must be trinary, scale or raw")
+    negate = _negate(path, entries.get("negate", 0))
+    image = read_stored(path.parent / name)[::-1]
+    white = float(np.iinfo(image.dtype).max)
+    has_opacity, unknown = image.shape[2] == 4, np.float32(0.5 * (occupied + free))
+    # Trinary maps count opacity as one more color, to which old maps owe their look.
+    shade = _mean(image if mode == "trinary" else image[..., :3] if has_opacity else image)
+    shade /= white
     if mode == "raw":
-        return np.where(values <= 100.0, values / 100.0, 0.5 * (occupied + free)).astype(np.float32)
-    share = values / 255.0
-    return (share if entries.get("negate", 0) else 1.0 - share).astype(np.float32)
+        percent = np.rint(255.0 * shade, out=shade)
+        return np.where(percent <= 100.0, percent / np.float32(100.0), unknown)
+    if not negate:
+        np.subtract(1.0, shade, out=shade)
+    if mode == "scale" and has_opacity:
+        shade[image[..., 3] < white] = unknown
+    return shade
 
 
-def _read_image(path: Path) -> Float32[np.ndarray, "h w"]:
-    """Gray values 0 to 255, the lowest row first."""
-    if not path.is_file():
-        raise DataError(path, "no such image")
-    try:
-        image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (cv2.error, OSError):
-        image = None
-    if image is None or image.dtype != np.uint8:
-        raise DataError(path, "is no image of 8 bits that can be read")
-    if image.size > 4 * _MOST_CELLS or not image.size:
-        raise DataError(path, f"has {image.size} values, a map has 1 to {_MOST_CELLS}")
-    gray = image if image.ndim == 2 else image[:, :, :3].mean(axis=2)
-    return np.ascontiguousarray(gray[::-1], dtype=np.float32)
+def _mean(image: Num[np.ndarray, "h w c"]) -> Float32[np.ndarray, "h w"]:
+    total = image[..., 0].astype(np.float32)
+    for channel in range(1, image.shape[2]):
+        total += image[..., channel]
+    total /= np.float32(image.shape[2])
+    return total

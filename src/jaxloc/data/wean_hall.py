@@ -13,12 +13,11 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from jaxloc.data.carmen import increasing, read_lines
+from jaxloc.data.carmen import increasing
 from jaxloc.data.io.errors import DataError
-from jaxloc.data.io.text import parse_numbers
-from jaxloc.data.laser_log import LaserLog
+from jaxloc.data.io.text import parse_numbers, read_lines
+from jaxloc.data.laser_log import LaserLog, find_mounting
 from jaxloc.poses import SE2
-from jaxloc.poses.planar import relative_poses
 from jaxloc.sensors import OccupancyMap
 
 _CELL = 0.1
@@ -40,12 +39,13 @@ def read_map(path: Path | str, *, resolution: float = _CELL) -> OccupancyMap:
         DataError: when the file is missing or malformed.
     """
     path = Path(path)
-    rows: list[list[float]] = []
+    rows: list[np.ndarray] = []
     for line, words in read_lines(path):
-        rows.append(parse_numbers(path, line, words, len(rows[0]) if rows else len(words)))
+        numbers = parse_numbers(path, line, words, len(rows[0]) if rows else len(words))
+        rows.append(np.array(numbers, dtype=np.float32))
     if not rows:
         raise DataError(path, "is empty")
-    free = np.array(rows, dtype=np.float32).T
+    free = np.stack(rows).T
     probability = np.where(free < 0.0, _UNKNOWN, 1.0 - free)
     if probability.min() < 0.0 or probability.max() > 1.0:
         raise DataError(path, "holds numbers that are neither -1 nor probabilities")
@@ -65,15 +65,16 @@ def read_log(path: Path | str) -> LaserLog:
         DataError: when the file is missing, malformed, or has no scan.
     """
     path = Path(path)
-    rows = [parse_numbers(path, line, words[1:], 7 + _BEAMS) for line, words in read_lines(path) if words[0] == "L"]
+    lines = ((line, words[1:]) for line, words in read_lines(path) if words[0] == "L")
+    rows = [np.array(parse_numbers(path, line, words, 7 + _BEAMS)) for line, words in lines]
     if not rows:
         raise DataError(path, "has no laser lines (L)")
-    table = np.array(rows)
+    table = np.stack(rows)
     keep = increasing(path, table[:, -1])
     table = table[keep]
     scale = np.array([0.01, 0.01, 1.0])
     odometry, lasers = table[:, :3] * scale, table[:, 3:6] * scale
-    mount = np.median(relative_poses(odometry, lasers), axis=0)
+    mounting = find_mounting(odometry, lasers)
     return LaserLog(
         name=path.name.split(".")[0],
         times=table[:, -1],
@@ -82,6 +83,7 @@ def read_log(path: Path | str) -> LaserLog:
         angle_min=-0.5 * math.pi,
         angle_increment=math.pi / _BEAMS,
         max_range=81.9,
-        mount=tuple(float(value) for value in mount),
+        mount=mounting.pose,
         dropped=int((~keep).sum()),
+        mounting=mounting.describe(),
     )

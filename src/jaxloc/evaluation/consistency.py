@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _linalg
 from jaxloc.beliefs import chi2_cdf, chi2_quantile
 from jaxloc.poses import Trajectory
 
@@ -77,10 +78,9 @@ def nees(error: Float[Array, " d"], covariance: Float[Array, "d d"]) -> SquaredE
     """
     finite = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(covariance))
     eye = jnp.eye(error.shape[0], dtype=error.dtype)
-    root = jnp.linalg.cholesky(jax.lax.stop_gradient(jnp.where(finite, covariance, eye)))
-    ok = finite & jnp.all(jnp.isfinite(root))
-    safe = jnp.where(ok, covariance, eye)
-    whitened = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(safe), jnp.where(ok, error, 0.0), lower=True)
+    root, definite = _linalg.first_cholesky(jnp.where(finite, covariance, eye)[None])
+    ok = finite & definite
+    whitened = _linalg.solve_lower(root, jnp.where(ok, error, 0.0))
     return SquaredErrors(jnp.sum(whitened**2), ok)
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _linalg
 from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, Motion, Sensor
@@ -113,7 +114,7 @@ class InformationFilter(Filter):
         size = mean.shape[0]
         # With x = F^-1 (x' - shift - noise w): equations in (w, x'), of which w is eliminated.
         shift = moved - matmul(transition, mean)
-        rows = jnp.linalg.solve(transition.T, state.information_sqrt).T
+        rows = _linalg.solve(transition.T, state.information_sqrt).T
         eye, zero = jnp.eye(size, dtype=mean.dtype), jnp.zeros((size, size), mean.dtype)
         left = jnp.block([[eye, zero], [-matmul(rows, noise), rows]])
         right = jnp.concatenate([jnp.zeros_like(mean), state.target + matmul(rows, shift)])

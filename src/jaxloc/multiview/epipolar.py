@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3, Direction
 from jaxloc.poses.lie_group import skew
@@ -55,7 +56,7 @@ def fundamental(essential: Float[Array, "3 3"], first: Pinhole, second: Pinhole)
         >>> jl.multiview.epipolar.fundamental(sideways, camera, camera).round(2).tolist()[2]
         [0.0, 0.7099999785423279, 0.0]
     """
-    inverse = [jnp.linalg.inv(camera.matrix()) for camera in (first, second)]
+    inverse = [_linalg.inverse(camera.matrix()) for camera in (first, second)]
     matrix = matmul(inverse[0].T, matmul(essential, inverse[1]))
     squared = jnp.sum(matrix * matrix)
     return matrix / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))

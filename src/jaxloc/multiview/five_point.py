@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc.multiview.epipolar import RelativePose, depth_signs, null_vector, unit_rays
 from jaxloc.poses import SO3, Direction, retract
@@ -122,7 +123,7 @@ def essential_candidates(
 def _null_space(first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> tuple[Float[Array, "4 3 3"], Array]:
     """An orthonormal basis of the matrices with ``x1^T E x2 = 0`` for all five."""
     rows = (first[:, :, None] * second[:, None, :]).reshape(5, 9)
-    q, r = jnp.linalg.qr(rows.T, mode="complete")
+    q, r = _linalg.qr(rows.T)
     diagonal = jnp.abs(jnp.diagonal(r))
     spans = jnp.min(diagonal) > 1e2 * float(jnp.finfo(rows.dtype).eps) * jnp.max(diagonal)
     return q[:, 5:].T.reshape(4, 3, 3), spans
@@ -140,7 +141,7 @@ def _eliminated(basis: Float[Array, "4 3 3"]) -> tuple[Float[Array, "10 10"], Bo
     cofactors = jnp.stack([minors[1, 2], minors[2, 0], minors[0, 1]])
     last = jnp.einsum("ic,ai,dca->d", cofactors, basis[:, 0], cubes, precision="highest")
     system = jnp.concatenate([nine, last[None]])
-    solved = jnp.linalg.solve(system[:, :10], system[:, 10:])
+    solved = _linalg.solve(system[:, :10], system[:, 10:])
     regular = jnp.all(jnp.isfinite(solved))
     return jnp.where(regular, solved, 0.0), regular
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc.multiview.epipolar import homogeneous
 from jaxloc.multiview.homography import normalizer
@@ -139,7 +140,7 @@ def seven_point(first: Float[Array, "7 2"], second: Float[Array, "7 2"]) -> Fund
     (to_first, x1), (to_second, x2) = (_normalized(points.T, used) for points in (first, second))
     rows = (x1[:, None] * x2[None]).reshape(9, -1).T
     frozen = lax.stop_gradient(rows)
-    q, r = jnp.linalg.qr(frozen.T, mode="complete")
+    q, r = _linalg.qr(frozen.T)
     diagonal = jnp.abs(jnp.diagonal(r))
     spans = jnp.all(used) & (jnp.min(diagonal) > 1e2 * float(jnp.finfo(rows.dtype).eps) * jnp.max(diagonal))
     pencil, roots = _singular_members(q[:, 7].reshape(3, 3), q[:, 8].reshape(3, 3))
@@ -185,7 +186,7 @@ def _null_direction(rows: Float[Array, "m k"]) -> tuple[Float[Array, " k"], Floa
     Derivative: with ``M = rows^T rows`` and its other pairs (s_k^2, v_k), ``dv = -sum v_k v_k^T dM v / (s_k^2 - s^2)``.
     """
     frozen = lax.stop_gradient(rows)
-    _, values, right = jnp.linalg.svd(jnp.where(jnp.isfinite(frozen), frozen, 0.0), full_matrices=False)
+    _, values, right = _linalg.svd(jnp.where(jnp.isfinite(frozen), frozen, 0.0))
     vector, others = right[-1], right[:-1]
     gaps = values[:-1] ** 2 - values[-1] ** 2
     clear = gaps > (10.0 * float(jnp.finfo(values.dtype).eps) * values[0]) ** 2
@@ -252,7 +253,7 @@ def _equations(rows: Float[Array, "7 9"], matrix: Float[Array, "3 3"]) -> Float[
 def _newton(rows: Float[Array, "7 9"], frozen: Float[Array, "7 9"], matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """Newton step, with derivatives by the rows alone; zero where the solution is not isolated."""
     last = jnp.stack([_cofactors(matrix).reshape(9), 2.0 * matrix.reshape(9)])
-    inverse = jnp.linalg.inv(lax.stop_gradient(jnp.concatenate([frozen, last])))
+    inverse = _linalg.inverse(lax.stop_gradient(jnp.concatenate([frozen, last])))
     inverse = jnp.where(jnp.all(jnp.isfinite(inverse)), inverse, 0.0)
     return matmul(inverse, _equations(rows, matrix)).reshape(3, 3)
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc._tree import detach_unless
 from jaxloc.images import Homography
@@ -83,7 +84,7 @@ def direct_linear_transform(
     rows_v = jnp.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)
     # Four points give eight rows; a ninth of zeros keeps the null vector in the thin decomposition.
     rows = jnp.concatenate([rows_u, rows_v, jnp.zeros_like(rows_u[:1])])
-    _, _, right = jnp.linalg.svd(rows, full_matrices=False)
+    _, _, right = _linalg.svd(rows)
     matrix = matmul(_denormalizer(to_pixels), matmul(right[8].reshape(3, 3), to_points))
     norm = jnp.sqrt(jnp.sum(matrix * matrix))
     good = jnp.isfinite(norm) & (norm > 0)

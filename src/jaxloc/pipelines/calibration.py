@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from jaxloc.multiview.rectification import Rectification, rectify
+from jaxloc.pipelines.board_order import find_orders
 from jaxloc.refinement.calibration import (
     BrownConradyModel,
     Corners,
@@ -96,12 +97,15 @@ class Result(eqx.Module):
         estimate: of all unknowns.
         rectification: of a pair.
         status: result of the solver, as text.
+        turned: pairs whose right corners were put into another order, which the errors do not follow: they are in the
+            order that was given. See `board_order`.
     """
 
     sides: tuple[Side, ...]
     estimate: Estimate
     rectification: Rectification | None
     status: str
+    turned: Bool[np.ndarray, " n"] | None = None
 
     @property
     def ok(self) -> bool:
@@ -147,17 +151,20 @@ def _mono(views: Views, config: Config) -> Result:
 
 
 def _stereo(left: Views, right: Views, config: Config) -> Result:
+    orders = find_orders(left.board, left.corners, right.corners, left.found & right.found, left.shape)
+    given, turned = right, (orders != np.arange(len(left.board))).any(axis=1)
+    right = eqx.tree_at(lambda v: v.corners, given, np.take_along_axis(given.corners, orders[..., None], axis=1))
     sides = _corners(left), _corners(right)
     board = jnp.asarray(left.board)
     fit = calibrate_stereo(board, *sides, intrinsics=config.intrinsics(), shape=left.shape, loss=_loss(config))
     value = fit.value
     boards_right = jax.vmap(lambda pose: value.T_left_right.inverse() @ pose)(value.T_left_board)
-    pair = (
-        _side(value.left, value.T_left_board, left, camera_parameters(fit, 0)),
-        _side(value.right, boards_right, right, camera_parameters(fit, 1)),
-    )
+    second = _side(value.right, boards_right, right, camera_parameters(fit, 1))
+    errors = np.take_along_axis(second.errors, np.argsort(orders, axis=1)[..., None], axis=1)
+    second = eqx.tree_at(lambda s: s.errors, second, errors)
+    pair = (_side(value.left, value.T_left_board, left, camera_parameters(fit, 0)), second)
     rectified = rectify(value.left, value.right, value.T_left_right, shape=left.shape)
-    return Result(pair, fit, rectified, fit.describe())
+    return Result(pair, fit, rectified, fit.describe(), turned)
 
 
 def _corners(views: Views) -> Corners:

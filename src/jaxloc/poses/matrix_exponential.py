@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 
 _HALVINGS, _TERMS = 4, 9
@@ -52,7 +53,7 @@ def logarithm(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
     for _ in range(_ROOTS):
         matrix = _square_root(matrix)
     eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
-    z = jnp.linalg.solve(matrix + eye, matrix - eye)
+    z = _linalg.solve(matrix + eye, matrix - eye)
     squared = matmul(z, z)
     series = eye / (2 * _ODD_TERMS + 1)
     for order in range(2 * _ODD_TERMS - 1, 0, -2):
@@ -63,5 +64,5 @@ def logarithm(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
 def _square_root(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
     root, other = matrix, jnp.eye(matrix.shape[0], dtype=matrix.dtype)
     for _ in range(_ROOT_STEPS):
-        root, other = 0.5 * (root + jnp.linalg.inv(other)), 0.5 * (other + jnp.linalg.inv(root))
+        root, other = 0.5 * (root + _linalg.inverse(other)), 0.5 * (other + _linalg.inverse(root))
     return root

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Problem, Quadratic, solve
 from jaxloc.solvers.gauss_newton import Solver
@@ -78,10 +79,12 @@ class PoseGraph(Problem):
         good = edges.valid & (edges.first >= 0) & (edges.second >= 0)
         good = good & (edges.first < count) & (edges.second < count) & (edges.first != edges.second)
         eye = jnp.eye(dof, dtype=edges.covariance.dtype)
-        known = jnp.linalg.cholesky(jnp.where(good[:, None, None], edges.covariance, eye[None]))
-        good = good & jnp.all(jnp.isfinite(known), axis=(1, 2))
+        known, definite = jax.vmap(lambda matrix: _linalg.first_cholesky(matrix[None]))(
+            jnp.where(good[:, None, None], edges.covariance, eye[None])
+        )
+        good = good & definite
         lower = jnp.where(good[:, None, None], known, eye[None])
-        whitener = jax.vmap(lambda matrix: jax.scipy.linalg.solve_triangular(matrix, eye, lower=True))(lower)
+        whitener = jax.vmap(lambda matrix: _linalg.forward_substitution(matrix, eye))(lower)
         neutral = type(poses).identity(eye.dtype)
         measured = jax.vmap(lambda use, pose: _where(use, pose, neutral))(good, edges.T_first_second)
         first, second = (jnp.where(good, ends, 0) for ends in (edges.first, edges.second))

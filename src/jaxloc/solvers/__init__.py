@@ -9,6 +9,7 @@ from jaxloc.solvers import (
     least_squares,
     point_alignment,
     problem,
+    qr,
     robust_kernels,
 )
 from jaxloc.solvers.assignment import Assignment, assign
@@ -19,6 +20,7 @@ from jaxloc.solvers.graduated_nonconvexity import solve_graduated
 from jaxloc.solvers.least_squares import solve
 from jaxloc.solvers.point_alignment import PointAlignment, Similarity, align_points, align_scaled_points
 from jaxloc.solvers.problem import FunctionProblem, Linearization, Problem
+from jaxloc.solvers.qr import QR
 from jaxloc.solvers.ransac import Candidates, Consensus, RobustEstimate, ransac, required_hypotheses
 from jaxloc.solvers.robust_kernels import Barron, Cauchy, GemanMcClure, Huber, Loss, Quadratic, Tukey
 
@@ -41,6 +43,7 @@ __all__ = [
     "Observability",
     "PointAlignment",
     "Problem",
+    "QR",
     "Quadratic",
     "RobustEstimate",
     "Similarity",
@@ -58,6 +61,7 @@ __all__ = [
     "least_squares",
     "point_alignment",
     "problem",
+    "qr",
     "ransac",
     "required_hypotheses",
     "robust_kernels",

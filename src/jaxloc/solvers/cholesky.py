@@ -112,7 +112,7 @@ class Cholesky(lx.AbstractLinearSolver):
     """The factorization as a lineax solver for (damped) normal equations.
 
     It squares the condition number of the Jacobian that QR works on, and is several times faster in batches. Use
-    ``lineax.QR()`` where the Jacobian's condition exceeds the square root of the precision: about 1e3 in float32, 1e7
+    `QR` where the Jacobian's condition exceeds the square root of the precision: about 1e3 in float32, 1e7
     in float64.
     """
 

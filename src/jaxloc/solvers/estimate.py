@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _linalg
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import tangent_labels
 from jaxloc.solvers.cholesky import rank_tolerance
@@ -81,7 +82,7 @@ class Estimate(eqx.Module):
         known = diagonal > jnp.finfo(diagonal.dtype).tiny
         scale = jnp.where(known, 1.0 / jnp.sqrt(jnp.where(known, diagonal, 1.0)), 1.0)
         scaled = self.information * scale[:, None] * scale[None, :]
-        eigenvalues, vectors = jnp.linalg.eigh(jnp.where(jnp.isfinite(scaled), scaled, 0.0))
+        eigenvalues, vectors = _linalg.eigh(jnp.where(jnp.isfinite(scaled), scaled, 0.0))
         directions = vectors * scale[:, None]
         directions = directions / jnp.linalg.norm(directions, axis=0, keepdims=True)
         determined = eigenvalues > rank_tolerance(eigenvalues.dtype)

@@ -30,7 +30,7 @@ class Solver(eqx.Module):
 
     Attributes:
         rtol: relative tolerance; None takes one that suits the dtype.
-        linear_solver: `Cholesky` on the normal equations, or ``lineax.QR()`` on the Jacobian.
+        linear_solver: `Cholesky` on the normal equations, or `QR` on the Jacobian.
     """
 
     rtol: float | None = eqx.field(default=None, static=True)

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _linalg
 from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE2, SE3, SO2, SO3
@@ -208,7 +209,7 @@ def _horn(cross: Float[Array, "3 3"]) -> tuple[SO3, Float[Array, ""]]:
     axis = jnp.stack([cross[1, 2] - cross[2, 1], cross[2, 0] - cross[0, 2], cross[0, 1] - cross[1, 0]])
     top = jnp.concatenate([trace[None], axis])[None, :]
     matrix = jnp.concatenate([top, jnp.concatenate([axis[:, None], symmetric], axis=1)])
-    values, vectors = jnp.linalg.eigh(matrix)
+    values, vectors = _linalg.eigh(matrix)
     return SO3.from_quaternion(vectors[:, 3]), values[3] - values[2]
 
 

@@ -119,3 +119,17 @@ def test_bad_input_is_one_line_and_writes_nothing(inputs, tmp_path, capsys):
     options.write_text("radial: 5\n")
     refuse("bad.yaml: BrownConradyModel got radial=5", [left], "--config", options)
     refuse("no calibration", [left / "view1.png"])
+
+
+def test_mixed_orientations_are_named(inputs, tmp_path, capsys):
+    """A lens belongs to the sensor: images that are turned in different ways are of no one camera."""
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\1\1\x12\0\3\0\0\0\1\0\3\0\0\0\0\0\0"
+    for number in (1, 2):
+        image = cv2.imread(str(inputs / "left" / f"view{number}.png"), cv2.IMREAD_GRAYSCALE)
+        data = cv2.imencode(".jpg", image)[1].tobytes()
+        tag = b"\xff\xe1\0" + bytes([len(exif) + 2]) + exif if number == 2 else b""
+        (tmp_path / f"{number}.jpg").write_bytes(data[:2] + tag + data[2:])
+    words = ["calibrate", tmp_path, "--grid", "6x5", "--square", "0.1", "--out", tmp_path / "out"]
+    assert run([str(word) for word in words]) == 2
+    error = capsys.readouterr().err
+    assert "2.jpg: has the EXIF orientation 3, but 1.jpg has 1" in error and error.count("\n") == 1

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.io
 
 from jaxloc.data import DataError
 from jaxloc.data.landmarks import read_factors, read_mrclam, read_ranging
@@ -137,3 +138,35 @@ def test_factor_lists(tmp_path):
     ):
         with pytest.raises(DataError, match=message):
             read_factors(write(tmp_path, "b.txt", text))
+
+
+@pytest.mark.parametrize("name", ["1e300", "0.5", "1e17"])
+def test_names_are_whole_numbers(tmp_path, mrclam, name):
+    with pytest.raises(DataError, match="too large|as the number of a landmark"):
+        read_factors(write(tmp_path, "c.txt", f"{STEP}LANDMARK 1 {name} 1 1 0 0 0\n"))
+    write(tmp_path, "A_DR.txt", "0 0 0\n1 1 0\n")
+    write(tmp_path, "A_TD.txt", f"0.5 2 {name} 5\n")
+    with pytest.raises(DataError, match="too large|as the number of a beacon"):
+        read_ranging(tmp_path, "A")
+    write(mrclam, "Barcodes.dat", f"6 {name}\n")
+    with pytest.raises(DataError, match="too large|as the number of a"):
+        read_mrclam(mrclam, 1)
+
+
+def test_an_empty_ground_truth_is_none(mrclam):
+    write(mrclam, "Robot1_Groundtruth.dat", "# nothing\n")
+    assert not read_mrclam(mrclam, 1).truth_valid.any()
+
+
+def test_a_survey_of_no_numbers_is_refused(tmp_path):
+    write(tmp_path, "A_DR.txt", "0 0 0\n1 1 0\n")
+    write(tmp_path, "A_TD.txt", "0.5 2 3 5\n")
+    for truth, beacons, message in (
+        (np.zeros((2, 4)), [[np.nan, 1, 2]], "not finite"),
+        (np.array([[0.0, 0, 0, 0], [np.nan, 0, 0, 0]]), [[3.0, 1, 2]], "not finite"),
+        (np.array([[0.0, 0, 0, 0], [1, 0, 0, 0]]), [[0.5, 1, 2]], "number of a beacon"),
+        (np.array([[0.0, 0, 0, 0], [1, 0, 0, 0]], dtype=complex), [[3j, 1, 2]], "A_.mat"),
+    ):
+        scipy.io.savemat(tmp_path / "A_.mat", {"GT": truth, "TL": np.array(beacons)})
+        with pytest.raises(DataError, match=message):
+            read_ranging(tmp_path, "A")

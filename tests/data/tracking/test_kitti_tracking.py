@@ -73,6 +73,19 @@ def test_detections_keep_the_highest_scores_and_count_the_others(write):
     assert found.select(found.scores > 0.7).valid.sum() == 1
 
 
+def test_a_sequence_without_poses(tmp_path):
+    calibration = "".join(f"P{i}: 700 0 30 0 0 700 20 0 0 0 1 0\n" for i in range(4)) + "R_rect: 1 0 0 0 1 0 0 0 1\n"
+    for name, text in (
+        ("calib", calibration + "".join(f"Tr_{name}: 1 0 0 0 0 1 0 0 0 0 1 0\n" for name in ("velo_cam", "imu_velo"))),
+        ("label_02", label(4)),
+        ("det_pointrcnn_Car", detection(1)),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "0000.txt").write_text(text)
+    sequence = read_kitti_tracking(tmp_path, "0000")
+    assert sequence.poses is None and len(sequence.detections) == len(sequence.truth.detections) == 5
+
+
 def test_files_without_rows(write):
     found = read_detections(write(""), num_frames=3)
     assert found.valid.shape == (3, 0) and found.positions.shape == (3, 0, 3)

@@ -65,3 +65,38 @@ def test_a_recording(recordings):
     assert len(truth.identities()) == 8
     # Results of a tracker score -1.
     assert read_mot_tracks(folder / "test.txt").detections.valid.sum() == 222
+
+
+def scored(*scores):
+    return "".join(f"{frame},-1,1,2,3,4,{score},-1,-1,-1\n" for frame, score in enumerate(scores, start=1))
+
+
+@pytest.mark.parametrize(
+    ("scores", "wanted"),
+    [
+        ((-1, -1), [1.0, 1.0]),
+        ((-1, 0.5), [1.0, 0.5]),
+        ((80.5, 20), [0.805, 0.2]),
+        ((100, -1), [1.0, 1.0]),
+        ((7, 7, 7), [1.0, 1.0, 1.0]),
+        ((1.0005, 0.25), [1.0, 0.25]),
+        ((0, 1), [0.0, 1.0]),
+        (("nan", 90.0, 20.0), [0.0, 0.9, 0.2]),
+    ],
+)
+def test_scores_are_probabilities(write, scores, wanted):
+    found = read_mot_detections(write(scored(*scores)))
+    np.testing.assert_allclose(found.scores[:, 0], wanted)
+
+
+@pytest.mark.parametrize("scores", [(-2.5, 0.3), (0.5, 3.0), (150, 20), (-1, -0.5, 0.5)])
+def test_raw_scores_are_named(write, scores):
+    with pytest.raises(DataError, match=r"det.txt: scores lie between .* must lie in 0..1"):
+        read_mot_detections(write(scored(*scores)))
+
+
+def test_a_late_frame_does_not_fill_the_memory(write):
+    with pytest.raises(DataError, match="line 61: 999999 frames of up to 60 rows are too many for 61 rows"):
+        read_mot_detections(write("1,-1,1,2,3,4,0.5\n" * 60 + "999999,-1,1,2,3,4,0.5\n"))
+    with pytest.raises(DataError, match="line 1: 1e.06 is no frame number"):
+        read_mot_detections(write("1000000,-1,1,2,3,4,0.5\n"))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc.alignment.correlation.scores import NormalizedCorrelation, Pair, Score, SumOfSquares
 from jaxloc.features.subpixel import newton_inverse
@@ -143,8 +144,8 @@ def _inverse(gram: Float[Array, "k k"], energy: Float[Array, ""]) -> tuple[Float
     textured = jnp.all(diagonal > floor)
     scale = jnp.where(textured, 1.0 / jnp.sqrt(jnp.where(textured, diagonal, 1.0)), 1.0)
     scaled = jnp.where(textured, gram * scale[:, None] * scale[None, :], eye)
-    regular = textured & (jnp.linalg.eigvalsh(lax.stop_gradient(scaled))[0] > 1e-3)
-    inverse = jnp.linalg.inv(jnp.where(regular, scaled, eye)) * scale[:, None] * scale[None, :]
+    regular = textured & (_linalg.eigh(lax.stop_gradient(scaled))[0][0] > 1e-3)
+    inverse = _linalg.inverse(jnp.where(regular, scaled, eye)) * scale[:, None] * scale[None, :]
     return jnp.where(regular, inverse, eye), regular
 
 
@@ -165,7 +166,7 @@ def _covariance(model: _Model, uv: Array, slope: Array, variance: Array) -> tupl
     estimator = estimator.reshape(2, -1)
     covariance = variance * matmul(estimator, estimator.T) + _LEAST_SIGMA**2 * jnp.eye(2, dtype=uv.dtype)
     covariance = lax.stop_gradient(covariance)
-    return covariance, jnp.linalg.inv(covariance)
+    return covariance, _linalg.inverse(covariance)
 
 
 def _transpose_shift(rows: Float[Array, "2 m n"], weights: list[Float[Array, ""]], axis: int) -> Float[Array, "2 p q"]:

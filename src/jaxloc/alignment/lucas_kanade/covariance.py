@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc._xla import compute_once
 from jaxloc.alignment.lucas_kanade.formulations import through
@@ -143,7 +144,7 @@ class AlignmentEquations(Equations):
 
 def _solve(matrix: Float[Array, "d d"], vector: Float[Array, " d"], ok: Bool[Array, ""]) -> Float[Array, " d"]:
     safe = jnp.where(ok, matrix, jnp.eye(matrix.shape[0], dtype=matrix.dtype))
-    return matmul(jnp.linalg.inv(safe), vector)
+    return matmul(_linalg.inverse(safe), vector)
 
 
 def conclude(
@@ -174,12 +175,12 @@ def conclude(
         (~finite, Status.NONFINITE),
     ):
         status = jnp.where(failed, int(code), status)
-    inverse = jnp.linalg.inv(jnp.where(deficient, jnp.eye(warp.dof, dtype=bread.dtype), bread))
+    inverse = _linalg.inverse(jnp.where(deficient, jnp.eye(warp.dof, dtype=bread.dtype), bread))
     tangent = matmul(inverse, matmul(noise.of_score, inverse.T))
     ok = (status == int(Status.CONVERGED)) & jnp.all(jnp.isfinite(tangent))
     to_pixels = data.frame.tangent_to_pixels(warp.dof, bread.dtype)
     covariance = matmul(to_pixels, matmul(jnp.where(ok, tangent, jnp.eye(warp.dof, dtype=tangent.dtype)), to_pixels.T))
-    from_pixels = jnp.linalg.inv(to_pixels)
+    from_pixels = _linalg.inverse(to_pixels)
     # In units of the template, whose contrast in the image is multiplied by the gain.
     contrast = match.gain**2 if method.formulation.inverse else jnp.ones_like(match.gain)
     information = matmul(from_pixels.T, matmul(match.hessian * contrast / noise.of_difference, from_pixels))

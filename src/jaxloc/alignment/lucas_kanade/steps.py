@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc.alignment.lucas_kanade.normal_equations import Equations
 from jaxloc.solvers.cholesky import factor
@@ -67,7 +68,7 @@ class NewtonStep(Descent):
         matrix = equations.hessian
         scale = 1.0 / jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(matrix)), jnp.finfo(matrix.dtype).tiny))
         scaled = matrix * scale[:, None] * scale[None, :]
-        return scale * jnp.linalg.solve(scaled, scale * equations.gradient)
+        return scale * _linalg.solve(scaled, scale * equations.gradient)
 
 
 class SteepestDescentStep(Descent):

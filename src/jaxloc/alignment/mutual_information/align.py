@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num
 
+from jaxloc import _linalg
 from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
 from jaxloc.alignment.lucas_kanade.pyramid_level import Frame
@@ -220,7 +221,7 @@ def _climb(scale: _Scale, warp: Warp, method: MutualInformation) -> _Ascent:
         return (at.count < method.max_steps) & (at.moved > tolerance) & (at.damping < 1e4)
 
     def advance(at: _Ascent) -> _Ascent:
-        values, vectors = jnp.linalg.eigh(at.hessian)
+        values, vectors = _linalg.eigh(at.hessian)
         sizes = jnp.maximum(jnp.abs(values), 1e-6 * jnp.max(jnp.abs(values)) + 1e-30)
         step = matmul(vectors, matmul(vectors.T, at.gradient) / (sizes + at.damping * jnp.max(sizes)))
         length = jnp.sqrt(jnp.sum(step * step) + 1e-30)
@@ -263,10 +264,10 @@ def _conclude(scale: _Scale, warp: Warp, moved: Array, count: Array, finite: Arr
     """Status, covariance, and one Newton step with the exact Hessian, which has the derivatives of the solution."""
     zero, frozen = jnp.zeros(warp.dof, scale.u.dtype), lax.stop_gradient(scale)
     curvature = -jax.hessian(lambda delta: _information(frozen, warp, delta))(zero)
-    values = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(curvature), curvature, 0.0))
+    values = _linalg.eigh(jnp.where(jnp.isfinite(curvature), curvature, 0.0))[0]
     regular = (values[0] > 1e-5 * values[-1]) & (values[-1] > 1e-8) & jnp.all(jnp.isfinite(curvature))
     eye = jnp.eye(warp.dof, dtype=zero.dtype)
-    inverse = jnp.linalg.inv(jnp.where(regular, curvature, eye))
+    inverse = _linalg.inverse(jnp.where(regular, curvature, eye))
     cost, gradient = jax.value_and_grad(lambda delta: -_information(scale, warp, delta))(zero)
     step = -matmul(inverse, gradient)
     known = frozen.sample(*warp.map_components(scale.u, scale.v))[1]
@@ -288,7 +289,7 @@ def _conclude(scale: _Scale, warp: Warp, moved: Array, count: Array, finite: Arr
     pixels = jnp.maximum(covered, 1.0)
     scaled = inverse / pixels + _least_covariance(frozen, warp, method)
     covariance = matmul(to_pixels, matmul(jnp.where(regular, scaled, eye), to_pixels.T))
-    from_pixels = jnp.linalg.inv(to_pixels)
+    from_pixels = _linalg.inverse(to_pixels)
     information = matmul(from_pixels.T, matmul(jnp.where(regular, curvature * pixels, 0.0 * eye), from_pixels))
     return Estimate(value, lax.stop_gradient(covariance), cost, ok, count, status, lax.stop_gradient(information))
 
@@ -298,4 +299,4 @@ def _least_covariance(scale: _Scale, warp: Warp, method: MutualInformation) -> F
     zero = jnp.zeros(warp.dof, scale.u.dtype)
     ways = jnp.concatenate(jax.jacfwd(lambda delta: _moved(scale, warp, delta))(zero)) * scale.frame.radius
     mean = matmul(ways.T, ways) / float(scale.u.shape[0])
-    return jnp.linalg.inv(mean) * (method.least_sigma**2 * 2.0 / warp.dof)
+    return _linalg.inverse(mean) * (method.least_sigma**2 * 2.0 / warp.dof)

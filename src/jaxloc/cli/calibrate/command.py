@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import cv2
 import equinox as eqx
 import numpy as np
 import typer
@@ -13,10 +12,11 @@ from jaxloc.cli import lifecycle, session
 from jaxloc.cli.calibrate import report
 from jaxloc.cli.lifecycle import Arguments
 from jaxloc.data import DataError, camera_file
+from jaxloc.data.io.files import natural_order
+from jaxloc.data.io.images import SUFFIXES, read_gray, read_orientation
 from jaxloc.data.io.writing import RowWriter, write_file
 from jaxloc.features.opencv.chessboard import board_points, find_chessboard
 
-_IMAGES = frozenset((".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"))
 _MOST_CORNERS = 10_000
 
 
@@ -80,6 +80,8 @@ def run_images(images: list[Path], right: list[Path] | None, board: tuple[str, f
         code = run.finish(record, config, inputs, _summary)
     for line in record.skipped():
         typer.echo(f"skipped {line}", err=True)
+    for path in record.turned():
+        typer.echo(f"turned {path}: its board was found from the other end", err=True)
     return code
 
 
@@ -106,7 +108,8 @@ def list_images(paths: list[Path]) -> list[Path]:
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
-            inside = sorted((p for p in path.iterdir() if p.suffix.lower() in _IMAGES and p.is_file()), key=_natural)
+            files = (p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
+            inside = sorted(files, key=natural_order)
             if not inside:
                 raise DataError(path, "holds no image")
             found += inside
@@ -123,6 +126,7 @@ def search(paths: list[Path], grid: tuple[int, int], title: str) -> Search:
     Raises:
         DataError: when no image can be read.
     """
+    _check_orientations(paths)
     common_shape = _common_shape(paths)
     corners: list[np.ndarray | None] = []
     reasons: list[str] = []
@@ -240,15 +244,25 @@ def _grid(text: str) -> tuple[int, int]:
     return along, down
 
 
-def _natural(path: Path) -> list[Any]:
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", path.name.lower())]
-
-
 def _read(path: Path) -> np.ndarray | None:
     try:
-        return cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except (cv2.error, OSError):
+        return read_gray(path)
+    except DataError:
         return None
+
+
+def _check_orientations(paths: list[Path]) -> None:
+    """A lens belongs to the sensor: images that are turned in different ways cannot be of one calibration."""
+    ways = {}
+    for path in paths:
+        try:
+            ways.setdefault(read_orientation(path), path)
+        except DataError:
+            continue  # named where it is read
+    if len(ways) > 1:
+        (first, path), (second, other) = list(ways.items())[:2]
+        what = f"has the EXIF orientation {second}, but {path.name} has {first}: one camera cannot have both"
+        raise DataError(other, f"{what}; remove the tags, so that all are as the sensor stores them")
 
 
 def _common_shape(paths: list[Path]) -> tuple[int, int]:

@@ -28,6 +28,13 @@ class Record:
         pairs = [pair for found in self.searches for pair in zip(found.paths, found.reasons, strict=True)]
         return [f"{path}: {reason}" for path, reason in pairs if reason]
 
+    def turned(self) -> list[str]:
+        """Right images in which the board was found from another end than in the left ones."""
+        if self.result.turned is None:
+            return []
+        pairs = zip(self.searches[1].paths, self.result.turned, strict=True)
+        return [str(path) for path, turned in pairs if turned]
+
     def metrics(self) -> dict[str, Any]:
         """The numbers of metrics.json: SI units, or the unit in the name."""
         used = [sum(corners is not None for corners in found.corners) for found in self.searches]
@@ -36,6 +43,7 @@ class Record:
             "images": sum(len(found.paths) for found in self.searches),
             "boards_used": sum(used),
             "skipped": self.skipped(),
+            "turned": self.turned(),
             "rms_px": float(np.sqrt(sum(square * count for square, count in squares) / sum(used))),
             "steps": int(self.result.estimate.num_steps),
         }
@@ -74,6 +82,8 @@ class Record:
         summary = f"{metrics['boards_used']} of {metrics['images']} images used."
         if skipped:
             summary += " Skipped: " + "; ".join(skipped) + "."
+        if metrics["turned"]:
+            summary += f" Boards found from the other end, and turned: {'; '.join(metrics['turned'])}."
         title = "Stereo calibration" if len(self.searches) == 2 else "Camera calibration"
         return report.render_report(title, sections, summary=summary, highlights=highlights)
 

@@ -2,6 +2,14 @@
 
 from pathlib import Path
 
+_LONGEST = 400
+
+
+def _one_line(text: str) -> str:
+    """Text with spaces for line ends, and codes for characters that a terminal would act on."""
+    plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    return plain if len(plain) <= _LONGEST else f"{plain[:_LONGEST]}..."
+
 
 class DataError(ValueError):
     """Unusable input: a one-line message that names the file and the fault.
@@ -16,6 +24,6 @@ class DataError(ValueError):
     """
 
     def __init__(self, path: Path | str, what: str):
-        super().__init__(f"{path}: {what}")
         self.path = Path(path)
-        self.what = what
+        self.what = _one_line(" ".join(what.splitlines()))
+        super().__init__(f"{_one_line(str(path))}: {self.what}")

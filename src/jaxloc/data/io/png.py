@@ -7,11 +7,12 @@ lead to the end chunk, and their checksums must be right (PNG specification, ISO
 import zlib
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from jaxloc.data.io.errors import DataError
+from jaxloc.data.io.files import open_file, read_bytes
+from jaxloc.data.io.images import check_pixels, decode_gray
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
@@ -19,12 +20,7 @@ _HEADER_LENGTH = 33
 
 
 def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise DataError(path, "no such image") from error
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror}") from error
+    return read_bytes(path, missing="no such image")
 
 
 def read_size(path: Path | str) -> tuple[int, int]:
@@ -40,19 +36,17 @@ def read_size(path: Path | str) -> tuple[int, int]:
         DataError: when it is missing, no PNG, or cut short.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEADER_LENGTH)
-            file.seek(max(file.seek(0, 2) - len(_END), 0))
-            tail = file.read()
-    except FileNotFoundError as error:
-        raise DataError(path, "no such image") from error
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror}") from error
+    with open_file(path, missing="no such image") as file:
+        head = file.read(_HEADER_LENGTH)
+        size = file.seek(0, 2)
+        file.seek(max(size - len(_END), 0))
+        tail = file.read()
     _check_signature(path, head)
     if len(head) < _HEADER_LENGTH or tail != _END:
         raise DataError(path, "truncated PNG image")
-    return int.from_bytes(head[20:24], "big"), int.from_bytes(head[16:20], "big")
+    rows, columns = int.from_bytes(head[20:24], "big"), int.from_bytes(head[16:20], "big")
+    check_pixels(path, rows * columns, size)
+    return rows, columns
 
 
 def _check_signature(path: Path, data: bytes) -> None:
@@ -104,7 +98,4 @@ def read_image(path: Path | str) -> UInt8[np.ndarray, "h w"]:
     path = Path(path)
     data = _read(path)
     _check_chunks(path, data)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise DataError(path, "PNG image that cannot be decoded")
-    return image
+    return decode_gray(path, data)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxloc.data.io.errors import DataError
-from jaxloc.data.io.text import parse_numbers, read_text
+from jaxloc.data.io.text import parse_numbers, read_text, whole_numbers
 from jaxloc.data.landmarks.landmark_log import LandmarkLog, assemble, ranges_and_bearings
 from jaxloc.poses.planar import compose_poses
 
@@ -30,7 +30,7 @@ def read_factors(path: Path | str) -> LandmarkLog:
         DataError: when the file is missing or malformed, poses do not follow each other, or nothing was seen.
     """
     steps, seen = [], []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path).split("\n"), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -41,6 +41,8 @@ def read_factors(path: Path | str) -> LandmarkLog:
     if not steps or not seen:
         raise DataError(path, "has no ODOMETRY or no LANDMARK lines")
     odometry, sightings = np.array(steps), np.array(seen)
+    for column, what in ((odometry[:, 0], "pose"), (odometry[:, 1], "pose"), (sightings[:, 1], "landmark")):
+        whole_numbers(path, column, what)
     count = len(odometry) + 1
     names = np.r_[odometry[:1, 0], odometry[:, 1]]
     if (names[:-1] != odometry[:, 0]).any() or (np.diff(names) <= 0).any():

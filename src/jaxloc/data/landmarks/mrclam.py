@@ -4,18 +4,15 @@ References:
     Leung, Halpern, Barfoot, Liu, "The UTIAS multi-robot cooperative localization and mapping dataset", IJRR 2011.
 """
 
-import gzip
-import zlib
 from pathlib import Path
 
 import numpy as np
 
 from jaxloc.data.io.errors import DataError
-from jaxloc.data.io.text import parse_numbers, read_rows
+from jaxloc.data.io.files import is_folder
+from jaxloc.data.io.text import check_seconds, read_rows, whole_numbers
 from jaxloc.data.landmarks.landmark_log import LandmarkLog, assemble, ranges_and_bearings
 from jaxloc.poses.planar import dead_reckon, interpolate_poses
-
-_LARGEST = 256 * 2**20  # bytes of one unpacked file: an hour of this robot has a few
 
 
 def read_mrclam(folder: Path | str, robot: int, *, truth_start: float | None = None, delay: float = 0.0) -> LandmarkLog:
@@ -40,14 +37,22 @@ def read_mrclam(folder: Path | str, robot: int, *, truth_start: float | None = N
         DataError: when a file is missing or malformed, or nothing was seen.
     """
     folder = Path(folder)
-    codes = {int(code): int(subject) for subject, code in _rows(folder / "Barcodes.dat", 2)}
+    if not is_folder(folder):
+        raise DataError(folder, "no such folder")
+    path, table = folder / "Barcodes.dat", _rows(folder / "Barcodes.dat", 2)
+    subjects, barcodes = (whole_numbers(path, table[:, i], "subject or bar code").tolist() for i in (0, 1))
+    codes = dict(zip(barcodes, subjects, strict=True))
     landmarks = _rows(folder / "Landmark_Groundtruth.dat", 5)
-    row_of = {int(name): row for row, name in enumerate(landmarks[:, 0])}
+    names = tuple(whole_numbers(folder / "Landmark_Groundtruth.dat", landmarks[:, 0], "landmark").tolist())
+    row_of = {name: row for row, name in enumerate(names)}
     odometry = _distinct(_rows(folder / f"Robot{robot}_Odometry.dat", 3))
     seen = _rows(folder / f"Robot{robot}_Measurement.dat", 4)
     if not len(odometry):
         raise DataError(folder, f"robot {robot} has no odometry")
-    rows = np.array([row_of.get(codes.get(int(code), 0), -1) for code in seen[:, 1]], dtype=np.int64)
+    check_seconds(folder / f"Robot{robot}_Odometry.dat", odometry[:, 0])
+    check_seconds(folder / f"Robot{robot}_Measurement.dat", seen[:, 0])
+    seen_codes = whole_numbers(folder / f"Robot{robot}_Measurement.dat", seen[:, 1], "bar code").tolist()
+    rows = np.array([row_of.get(codes.get(code, 0), -1) for code in seen_codes], dtype=np.int64)
     kept = (rows >= 0) & (seen[:, 0] >= odometry[0, 0])
     if not kept.any():
         raise DataError(folder, f"robot {robot} saw no landmark")
@@ -57,7 +62,6 @@ def read_mrclam(folder: Path | str, robot: int, *, truth_start: float | None = N
     start = float(odometry[0, 0])
     poses = dead_reckon(odometry[:, 0] - start, odometry[:, 1:], seen[:, 0] - start - delay)
     truth = _truth(folder, robot, seen[:, 0], truth_start)
-    names = tuple(int(name) for name in landmarks[:, 0])
     readings = ranges_and_bearings(seen[:, 2], seen[:, 3], rows)
     return assemble(start, seen[:, 0] - start, poses, readings, (names, landmarks[:, 1:3]), truth)
 
@@ -74,6 +78,8 @@ def _truth(folder: Path, robot: int, at: np.ndarray, truth_start: float | None) 
         tum = _distinct(_rows(packed[0], 8))
         heading = 2.0 * np.arctan2(tum[:, 6], tum[:, 7])
         table = np.column_stack([tum[:, 0] + truth_start, tum[:, 1], tum[:, 2], heading])
+    if not len(table):
+        return np.zeros((len(at), 3)), np.zeros(len(at), bool)
     known = (at >= table[0, 0]) & (at <= table[-1, 0])
     return interpolate_poses(table[:, 0], table[:, 1:], at), known
 
@@ -86,18 +92,5 @@ def _distinct(rows: np.ndarray) -> np.ndarray:
 def _rows(path: Path, count: int) -> np.ndarray:
     """A table of numbers, from the file or its gzipped form."""
     packed = path if path.suffix == ".gz" else path.with_name(path.name + ".gz")
-    if path.suffix != ".gz" and (path.exists() or not packed.exists()):
-        return read_rows(path, count)
-    try:
-        with gzip.open(packed, "rb") as stream:
-            data = stream.read(_LARGEST + 1)
-    except (OSError, EOFError, zlib.error) as error:
-        raise DataError(packed, f"cannot be unpacked: {error}") from error
-    if len(data) > _LARGEST:
-        raise DataError(packed, f"holds more than {_LARGEST // 2**20} MiB")
-    rows = []
-    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), start=1):
-        words = line.split("#", 1)[0].split()
-        if words:
-            rows.append(parse_numbers(packed, number, words, count))
-    return np.array(rows).reshape(len(rows), count)
+    plain = path.suffix != ".gz" and (path.exists() or not packed.exists())
+    return read_rows(path if plain else packed, count)

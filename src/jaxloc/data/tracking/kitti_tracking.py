@@ -22,7 +22,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxloc.data.io.errors import DataError
-from jaxloc.data.io.text import check_rotations, parse_numbers, read_rows, read_text
+from jaxloc.data.io.files import is_folder
+from jaxloc.data.io.text import (
+    check_rotations,
+    is_whole,
+    parse_any_numbers,
+    parse_numbers,
+    read_rows,
+    read_text,
+)
 from jaxloc.data.tracking.records import Detections, LabeledTracks, Rows, assemble, assemble_tracks, check_frame
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person", "Cyclist", "Tram", "Misc")
@@ -84,14 +92,14 @@ def read_kitti_tracking(
         DataError: with one line that names the file, and the line of it, that is missing or wrong.
     """
     folder, file = Path(folder), f"{name}.txt"
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise DataError(folder, "no such folder")
     calibration = read_calibration(folder / "calib" / file)
     posed = folder / "orbslam3_poses" / file
     poses = read_camera_poses(posed) if posed.exists() else None
     found, labels = folder / detector / file, folder / "label_02" / file
     if poses is None:
-        length = max(len(read_detections(found)), len(read_labels(labels, types=TYPES)))
+        length = max(len(read_detections(found)), len(read_labels(labels, types=TYPES).detections))
     else:
         length = len(poses)
     detections = read_detections(found, num_frames=length, poses=poses)
@@ -125,7 +133,7 @@ def read_labels(
     if unknown:
         raise ValueError(f"Labels have the types {', '.join(TYPES)}; it got {', '.join(sorted(unknown))}.")
     rows, kinds, lines = [], [], []
-    for line, text in enumerate(read_text(path).splitlines(), start=1):
+    for line, text in enumerate(read_text(path).split("\n"), start=1):
         words = text.split()
         if not words:
             continue
@@ -172,16 +180,13 @@ def read_detections(
         DataError: when the file is missing, or a line is malformed or of an unknown class.
     """
     rows, lines = [], []
-    for line, text in enumerate(read_text(path).splitlines(), start=1):
+    for line, text in enumerate(read_text(path).split("\n"), start=1):
         words = text.replace(",", " ").split()
         if not words:
             continue
         if len(words) != 15:
             raise DataError(path, f"line {line} has {len(words)} numbers, needs 15")
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            raise DataError(path, f"line {line} holds something that is no number") from None
+        values = parse_any_numbers(path, line, words)
         check_frame(path, line, values[0], first=0)
         if values[1] not in _CLASSES:
             raise DataError(path, f"line {line}: {values[1]:g} is no class (1, 2 or 3)")
@@ -227,7 +232,7 @@ def read_calibration(path: Path | str) -> KittiCalibration:
         DataError: when the file, or a matrix, is missing or malformed.
     """
     matrices = {}
-    for line, text in enumerate(read_text(path).splitlines(), start=1):
+    for line, text in enumerate(read_text(path).split("\n"), start=1):
         name, *words = text.replace(":", " ", 1).split() or [""]
         if name:
             matrices[name] = np.array(parse_numbers(path, line, words, 9 if name.startswith("R") else 12))
@@ -247,5 +252,5 @@ def read_calibration(path: Path | str) -> KittiCalibration:
 
 
 def _check_identity(path: Path | str, line: int, value: float) -> None:
-    if value < 0 or value != int(value):
+    if value < 0 or not is_whole(value):
         raise DataError(path, f"line {line}: {value:g} is no identity (whole, from 0)")

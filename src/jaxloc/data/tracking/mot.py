@@ -16,11 +16,14 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxloc.data.io.errors import DataError
-from jaxloc.data.io.text import read_text
+from jaxloc.data.io.text import is_whole, parse_any_numbers, read_text
 from jaxloc.data.io.writing import write_file
 from jaxloc.data.tracking.records import Detections, LabeledTracks, Rows, assemble, assemble_tracks, check_frame
 
 _FEWEST, _MOST = 7, 10
+_NOT_GIVEN = -1.0
+_ROUNDING = 1e-3
+_LEAST_PERCENT = 10.0  # a detector that is never as sure as this gives no percent
 
 
 def read_mot_detections(
@@ -28,7 +31,9 @@ def read_mot_detections(
 ) -> Detections:
     """Reads detections (``det.txt``).
 
-    Detections with non-finite values, or boxes without area, are left out and counted.
+    Detections with non-finite values, or boxes without area, are left out and counted. Scores are probabilities; -1 is
+    the format's mark for a score that is not given, and such a detection counts as sure; scores in percent are divided
+    by 100.
 
     Args:
         path: the file.
@@ -40,9 +45,11 @@ def read_mot_detections(
         The detections.
 
     Raises:
-        DataError: when the file is missing, or a line is malformed.
+        DataError: when the file is missing, a line is malformed, or scores are neither probabilities nor percent.
     """
-    rows = _rows(*_read(path))
+    values, lines = _read(path)
+    values[:, 6] = _confidences(path, values[:, 6])
+    rows = _rows(values, lines)
     return assemble(path, rows, rate=rate, first=1, num_frames=num_frames, capacity=capacity)
 
 
@@ -62,7 +69,7 @@ def read_mot_tracks(path: Path | str, *, num_frames: int | None = None, rate: fl
     """
     values, lines = _read(path)
     for identity, line in zip(values[:, 1], lines, strict=True):
-        if not 0 <= identity < 2**53 or identity != int(identity):
+        if identity < 0 or not is_whole(identity):
             raise DataError(path, f"line {line}: {identity:g} is no identity (whole, from 0)")
     counted = values[:, 6] != 0.0
     rows = _rows(values[counted], lines[counted], values[counted, 1].astype(np.int64))
@@ -98,6 +105,21 @@ def write_mot(path: Path | str, tracks: LabeledTracks) -> None:
     write_file(path, "".join(lines))
 
 
+def _confidences(path: Path | str, scores: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Scores between 0 and 1."""
+    given = np.isfinite(scores) & (scores != _NOT_GIVEN)
+    least, most = scores[given].min(initial=np.inf), scores[given].max(initial=-np.inf)
+    scale = 1.0
+    if given.any() and not (least >= 0.0 and most <= 1.0 + _ROUNDING):
+        if least == most:  # says nothing about any
+            return np.where(given, 1.0, np.where(scores == _NOT_GIVEN, 1.0, scores))
+        if not (least >= 0.0 and _LEAST_PERCENT <= most <= 100.0):
+            ends = f"scores lie between {least:.6g} and {most:.6g}"
+            raise DataError(path, f"{ends}, must lie in 0..1 (or all be -1, or be percent): convert them")
+        scale = 100.0
+    return np.where(scores == _NOT_GIVEN, 1.0, np.where(given, np.minimum(scores / scale, 1.0), scores))
+
+
 def _rows(
     values: Float64[np.ndarray, "n 7"], lines: Int64[np.ndarray, " n"], ids: Int64[np.ndarray, " n"] | None = None
 ) -> Rows:
@@ -108,7 +130,7 @@ def _rows(
 def _read(path: Path | str) -> tuple[Float64[np.ndarray, "n 7"], Int64[np.ndarray, " n"]]:
     """The first seven numbers of each line, and its line number."""
     rows, lines = [], []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path).split("\n"), start=1):
         words = line.replace(",", " ").split()
         if not words:
             continue
@@ -120,9 +142,6 @@ def _read(path: Path | str) -> tuple[Float64[np.ndarray, "n 7"], Int64[np.ndarra
 def _parse(path: Path | str, line: int, words: Sequence[str]) -> list[float]:
     if not _FEWEST <= len(words) <= _MOST:
         raise DataError(path, f"line {line} has {len(words)} numbers, needs {_FEWEST} to {_MOST}")
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        raise DataError(path, f"line {line} holds something that is no number") from None
+    values = parse_any_numbers(path, line, words)
     check_frame(path, line, values[0], first=1)
     return values[:_FEWEST]

@@ -13,6 +13,10 @@ from jaxtyping import Bool, Float64, Int64
 from jaxloc.data.io.errors import DataError
 
 _MOST_FRAMES = 10**6  # a greater frame number is an error in the file
+# Slots of all frames: a file may need this many, or so many for each of its rows.
+_FREE_CELLS, _CELLS_PER_ROW = 500_000, 8
+_MOST_PRESENCES = 10_000_000  # identities times frames
+_LARGEST = 1e30  # beyond it single precision ends
 
 
 class Detections(eqx.Module):
@@ -86,9 +90,9 @@ class Rows(eqx.Module):
 
     def usable(self) -> Bool[np.ndarray, " n"]:
         """Rows with finite values; boxes without 3-D objects need a positive area."""
-        good = np.isfinite(self.boxes).all(axis=1) & np.isfinite(self.scores)
+        good = (np.abs(self.boxes) < _LARGEST).all(axis=1) & (np.abs(self.scores) < _LARGEST)
         if self.objects is not None:
-            return good & np.isfinite(self.objects).all(axis=1)
+            return good & (np.abs(self.objects) < _LARGEST).all(axis=1)
         return good & (self.boxes[:, 2] > self.boxes[:, 0]) & (self.boxes[:, 3] > self.boxes[:, 1])
 
 
@@ -208,6 +212,9 @@ def assemble_tracks(
         raise DataError(path, f"line {rows.lines[again[0]]}: identity {identity} occurs twice in frame {frame}")
     found = assemble(path, rows, rate=rate, first=first, num_frames=num_frames, names=names, poses=poses)
     table = _table(path, rows, first, num_frames, None)
+    count = len(np.unique(rows.ids))
+    if count * len(table) > _MOST_PRESENCES:
+        raise DataError(path, f"{count} identities in {len(table)} frames are too many")
     return LabeledTracks(found, np.where(found.valid, _scatter(rows.ids, table), -1))
 
 
@@ -227,7 +234,8 @@ def check_frame(path: Path | str, line: int, value: float, first: int) -> int:
         DataError: it is not whole, too small or too large.
     """
     if not (first <= value < _MOST_FRAMES and value == int(value)):
-        raise DataError(path, f"line {line}: {value:g} is no frame number (whole, from {first})")
+        limits = f"whole, from {first}" if value < _MOST_FRAMES else f"whole, below {_MOST_FRAMES}"
+        raise DataError(path, f"line {line}: {value:g} is no frame number ({limits})")
     return int(value)
 
 
@@ -242,10 +250,13 @@ def _table(
         line = rows.lines[frames.argmax()]
         raise DataError(path, f"line {line}: frame {last + first} is beyond the last of {count} frames")
     used = np.flatnonzero(rows.usable())
+    room = int(np.bincount(frames[used]).max(initial=0)) if capacity is None else capacity
+    if count * room > max(_FREE_CELLS, _CELLS_PER_ROW * len(frames)):
+        line = f"line {rows.lines[frames.argmax()]}: " if num_frames is None and len(frames) else ""
+        raise DataError(path, f"{line}{count} frames of up to {room} rows are too many for {len(frames)} rows")
     used = used[np.lexsort((-rows.scores[used], frames[used]))]
     starts = np.searchsorted(frames[used], np.arange(count))
     slots = np.arange(len(used)) - starts[frames[used]]
-    room = int(slots.max(initial=-1)) + 1 if capacity is None else capacity
     kept = slots < room
     table = np.full((count, room), -1, np.int64)
     table[frames[used[kept]], slots[kept]] = used[kept]

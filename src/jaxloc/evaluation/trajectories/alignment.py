@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 
 
@@ -67,7 +68,7 @@ def _umeyama(
     # The alignment minimizes the sum of squares: its own change has no effect on it (envelope theorem), so the RMSE has
     # its exact gradient without that of the decomposition, which does not exist on a straight path.
     covariance = jax.lax.stop_gradient(matmul((weights * b).T, a))
-    u, spectrum, vt = jnp.linalg.svd(covariance)
+    u, spectrum, vt = _linalg.svd(covariance)
     sign = jnp.where(jnp.linalg.det(u) * jnp.linalg.det(vt) < 0, -1.0, 1.0).astype(points.dtype)
     signs = jnp.ones(3, points.dtype).at[2].set(sign)
     rotation = matmul(u * signs[None], vt)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.refinement.bundle.structure import Structure
@@ -95,7 +96,7 @@ class Gauge(eqx.Module):
         """Pose priors with covariances, where ``valid``."""
         eye = jnp.eye(6, dtype=covariance.dtype)
         safe = jnp.where(valid[:, None, None], covariance, eye[None])
-        information = jnp.where(valid[:, None, None], jnp.linalg.inv(safe), 0.0)
+        information = jnp.where(valid[:, None, None], jax.vmap(_linalg.inverse)(safe), 0.0)
         return Gauge(jnp.zeros(valid.shape, bool), poses, information)
 
     def cost(self, poses: SE3) -> Float[Array, ""]:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3
 from jaxloc.refinement.calibration.camera import check_corners, fit, prepare, transform_estimate
@@ -133,7 +134,7 @@ def _join(single: list[Unknowns], valid: list[Array]) -> Unknowns:
     relative = jax.vmap(lambda a, b: a @ b.inverse())(left, right)
     count = jnp.maximum(jnp.sum(both), 1.0)
     rotation = jnp.sum(relative.rotation.rotation_matrix * both[:, None, None], axis=0) / count
-    u, _, v = jnp.linalg.svd(jnp.where(jnp.sum(both) > 0, rotation, jnp.eye(3, dtype=rotation.dtype)))
+    u, _, v = _linalg.svd(jnp.where(jnp.sum(both) > 0, rotation, jnp.eye(3, dtype=rotation.dtype)))
     mean = SE3(SO3(matmul(u, v)), jnp.sum(relative.translation * both[:, None], axis=0) / count)
     carried_over = jax.vmap(lambda b: mean @ b)(right)
     only_right = ~seen_left & seen_right

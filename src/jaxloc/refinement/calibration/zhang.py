@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc.multiview.homography import direct_linear_transform
 from jaxloc.poses import SE3, SO3
@@ -133,7 +134,7 @@ def _root(value: Array) -> Array:
 def _zhang(conics: Float[Array, "n 3 3"]) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     rows = _equations(conics)
     rows = jnp.concatenate([rows, jnp.zeros((5, 5), rows.dtype)])
-    b11, b22, b13, b23, b33 = jnp.linalg.svd(rows, full_matrices=False)[2][4]
+    b11, b22, b13, b23, b33 = _linalg.svd(rows)[2][4]
     cx, cy = -b13 / b11, -b23 / b22
     size = b33 + cx * b13 + cy * b23
     return jnp.stack([_root(size / b11), _root(size / b22)]), jnp.stack([cx, cy])
@@ -168,7 +169,7 @@ def _pose(matrix: Float[Array, "3 3"], focal: Float[Array, "2"], center: Float[A
     rotation = jnp.stack([h[:, 0], h[:, 1], jnp.cross(h[:, 0], h[:, 1])], axis=1)
     good = jnp.all(jnp.isfinite(rotation)) & jnp.all(jnp.isfinite(h))
     eye = jnp.eye(3, dtype=h.dtype)
-    left, _, right = jnp.linalg.svd(jnp.where(good, rotation, eye))
+    left, _, right = _linalg.svd(jnp.where(good, rotation, eye))
     turned = matmul(left, right)
     turned = jnp.where(jnp.linalg.det(turned) > 0, turned, eye)
     return SE3(SO3(turned), jnp.where(good, h[:, 2], 0.0))

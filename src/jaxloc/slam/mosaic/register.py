@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc import _linalg
 from jaxloc._linalg import matmul
 from jaxloc.alignment.lucas_kanade import LucasKanade, Pyramid, align
 from jaxloc.images.interpolation import AbstractInterpolation, Bilinear, sample_components
@@ -94,7 +95,7 @@ def in_meters(estimate: Estimate, outer: Raster, inner: Raster) -> Estimate:
     Interpolation leaves errors of some thousandths of a pixel whatever the noise; their variance is added.
     """
     forth = inner.tangent_to_meters()
-    back = jnp.linalg.inv(forth)
+    back = _linalg.inverse(forth)
     shift = _INTERPOLATION * inner.resolution
     turn = jnp.full_like(shift, _INTERPOLATION / (0.5 * min(inner.shape)))
     covariance = matmul(forth, matmul(estimate.covariance, forth.T)) + jnp.diag(jnp.stack([shift, shift, turn]) ** 2)

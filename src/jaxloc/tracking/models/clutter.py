@@ -95,4 +95,4 @@ class FrustumClutter(Clutter):
         jacobian = jax.jacfwd(lambda p: self.rig.project(p[None])[0])(point)
         largest = self.rig.camera.fx * self.rig.baseline / self.nearest
         volume = self.width * self.height * largest
-        return jnp.where(seen, jnp.linalg.slogdet(jacobian)[1] - jnp.log(volume), -math.inf)
+        return jnp.where(seen, jnp.log(jnp.abs(jnp.linalg.det(jacobian))) - jnp.log(volume), -math.inf)

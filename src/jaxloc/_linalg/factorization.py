@@ -1,16 +1,11 @@
-"""Linear algebra that all rooms share: precise products, a Cholesky factorization that never fails, substitution."""
+"""Cholesky factorization that never fails, and substitution."""
 
-import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._linalg.lapack import first_cholesky, solve_lower
+
 UNROLLED = 9  # up to this size unrolled columns are faster than the library's factorization under vmap
-
-
-def matmul(a: Array, b: Array) -> Array:
-    """Matrix product at full precision: accelerators otherwise round the factors of geometry to 10 bits."""
-    return jnp.matmul(a, b, precision="highest")
 
 
 def cholesky(matrix: Float[Array, "d d"], floor: float) -> tuple[Float[Array, "d d"], Bool[Array, " d"]]:
@@ -56,7 +51,7 @@ def forward_substitution(
         [1.0, 1.0]
     """
     if lower.shape[0] > UNROLLED:
-        return solve_triangular(lower, right, lower=True)
+        return solve_lower(lower, right)
     solution: list[Array] = []
     for i in range(lower.shape[0]):
         value = right[i]
@@ -104,29 +99,5 @@ def _unrolled(matrix: Float[Array, "d d"], floor: float) -> tuple[Float[Array, "
 def _by_library(matrix: Float[Array, "d d"], floor: float) -> tuple[Float[Array, "d d"], Bool[Array, " d"]]:
     eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
     trials = jnp.stack([matrix, matrix + jnp.sqrt(jnp.finfo(matrix.dtype).eps) * eye])
-    lower, failed = _first_factor(trials)
-    return lower, (jnp.diagonal(lower) ** 2 < floor) | failed
-
-
-@jax.custom_jvp
-def _first_factor(trials: Float[Array, "2 d d"]) -> tuple[Float[Array, "d d"], Bool[Array, ""]]:
-    """The factor of the first of two matrices that has one (else the identity), and whether the first one failed.
-
-    One stacked call: under `vmap`, two independent batched factorizations compete for XLA's threads on a processor.
-    """
-    factors = jnp.linalg.cholesky(trials)
-    finite = jnp.all(jnp.isfinite(factors), axis=(1, 2))
-    shifted = jnp.where(finite[1], factors[1], jnp.eye(trials.shape[1], dtype=trials.dtype))
-    return jnp.where(finite[0], factors[0], shifted), ~finite[0]
-
-
-@_first_factor.defjvp
-def _first_factor_jvp(primals, tangents):
-    """``dL = L phi(L^-1 dA L^-T)``, phi the lower triangle with half its diagonal; both matrices change by one dA."""
-    lower, failed = _first_factor(primals[0])
-    change = jnp.asarray(tangents[0])[0]
-    change = 0.5 * (change + change.T)
-    half = solve_triangular(lower, change, lower=True)
-    inner = jnp.tril(solve_triangular(lower, half.T, lower=True))
-    inner = inner - 0.5 * jnp.diag(jnp.diagonal(inner))
-    return (lower, failed), (matmul(lower, inner), jnp.zeros(failed.shape, jax.dtypes.float0))
+    lower, first = first_cholesky(trials)
+    return lower, (jnp.diagonal(lower) ** 2 < floor) | ~first

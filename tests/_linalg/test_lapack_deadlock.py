@@ -1,0 +1,17 @@
+"""No batch of a program with linear algebra waits for ever; each is a process of its own, which can be stopped."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).with_name("batches.py")
+PROGRAMS = ("pose_graphs", "calibrations", "bundles", "camera_poses", "kalman_filters")
+LIMIT = 300  # s; each takes less than 60
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_a_thousand_batches_end(program):
+    subprocess.run([sys.executable, str(SCRIPT), program, "1000"], check=True, timeout=LIMIT)
