@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 from jax.test_util import check_grads
 
-from jaxloc._linalg import eigh, first_cholesky, inverse, qr, solve, solve_lower, svd, triangular_factor
+from jaxloc._linalg import eigh, first_cholesky, inverse, matmul, qr, solve, solve_lower, svd, triangular_factor
 
 SIZES = (1, 2, 3, 6, 12, 21)
 
@@ -122,3 +122,18 @@ def test_derivatives(rng, x64, size):
 
 def test_derivatives_at_equal_eigenvalues_are_finite():
     assert jnp.isfinite(jax.grad(lambda matrix: jnp.sum(eigh(matrix)[1]))(jnp.eye(3))).all()
+
+
+def test_batches_of_batches(rng):
+    """XLA refuses a product of what nested loops return; batches of batches are one loop."""
+    matrices = jnp.asarray(rng.normal(size=(2, 3, 4, 3, 3)), jnp.float32)
+
+    def rotation(matrix):
+        left, _, right = svd(matrix)
+        return matmul(left, right)
+
+    found = jax.jit(jax.vmap(jax.vmap(jax.vmap(rotation))))(matrices)
+    left, _, right = np.linalg.svd(np.asarray(matrices))
+    np.testing.assert_allclose(found, left @ right, atol=1e-5)
+    fixed = jax.vmap(lambda scale: jax.vmap(lambda matrix: scale * rotation(matrix))(matrices[0, 0]))(jnp.arange(2.0))
+    np.testing.assert_allclose(fixed[1], (left @ right)[0, 0], atol=1e-5)

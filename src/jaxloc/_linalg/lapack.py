@@ -22,28 +22,36 @@ _SMALL = 16  # rows; up to here, elimination in plain XLA operations
 
 def _one_at_a_time(call: Callable) -> Callable:
     """A function of arrays that a batch evaluates one after the other on a CPU."""
+
+    def in_turn(*arrays: Array) -> Any:
+        return lax.map(lambda item: call(*item), arrays)
+
     single = custom_vmap(call)
+    many = custom_vmap(lambda *arrays: lax.platform_dependent(*arrays, cpu=in_turn, default=jax.vmap(call)))
 
     @single.def_vmap
     def _(axis_size: int, in_batched: list[bool], *arrays: Array) -> tuple[Any, Any]:
-        del axis_size
-        batched = tuple(array for array, varies in zip(arrays, in_batched, strict=True) if varies)
-        fixed = tuple(array for array, varies in zip(arrays, in_batched, strict=True) if not varies)
+        found = many(*_stacked(axis_size, in_batched, arrays))
+        return found, jax.tree.map(lambda _: True, found)
 
-        def merged(some: tuple, rest: tuple) -> list:
-            varying, constant = iter(some), iter(rest)
-            return [next(varying) if varies else next(constant) for varies in in_batched]
-
-        def loop(some: tuple, rest: tuple) -> Any:
-            return lax.map(lambda item: single(*merged(item, rest)), some)
-
-        def batch(some: tuple, rest: tuple) -> Any:
-            return jax.vmap(call, in_axes=[0 if varies else None for varies in in_batched])(*merged(some, rest))
-
-        found = lax.platform_dependent(batched, fixed, cpu=loop, default=batch)
+    @many.def_vmap
+    def _(axis_size: int, in_batched: list[bool], *arrays: Array) -> tuple[Any, Any]:
+        # A batch of batches is one batch: XLA fails on products of what nested loops return.
+        stacked = _stacked(axis_size, in_batched, arrays)
+        sizes = stacked[0].shape[:2]
+        found = many(*(array.reshape(sizes[0] * sizes[1], *array.shape[2:]) for array in stacked))
+        found = jax.tree.map(lambda array: array.reshape(*sizes, *array.shape[1:]), found)
         return found, jax.tree.map(lambda _: True, found)
 
     return single
+
+
+def _stacked(size: int, batched: list[bool], arrays: tuple[Array, ...]) -> list[Array]:
+    """Arrays that all have the axis of the batch."""
+    return [
+        array if varies else jnp.broadcast_to(array, (size, *array.shape))
+        for array, varies in zip(arrays, batched, strict=True)
+    ]
 
 
 @jax.custom_jvp
