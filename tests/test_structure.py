@@ -1,6 +1,7 @@
 """The house rules: rows, lengths, depths, documentation, imports, and what the README promises."""
 
 import ast
+import functools
 import importlib
 import importlib.util
 import inspect
@@ -29,6 +30,7 @@ def name_of(path: Path) -> str:
     return str(path.relative_to(SOURCE))
 
 
+@functools.cache
 def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 

@@ -121,7 +121,7 @@ def similarity(
         >>> import jax, jax.numpy as jnp
         >>> from jaxloc.images.gradients import smooth
         >>> scene = smooth(jax.random.normal(jax.random.key(0), (96, 96)), 2.0)
-        >>> found = similarity(jnp.rot90(scene), scene)
+        >>> found = jax.jit(similarity)(jnp.rot90(scene), scene)
         >>> bool(found.ok), round(float(jnp.abs(found.value.log()[2])), 2)
         (True, 1.57)
     """

@@ -85,8 +85,8 @@ class InteractingMultipleModel(Filter):
         >>> modes = [jl.filters.KalmanFilter(jl.filters.ConstantVelocity(q, axes=1), sensor) for q in (1e-4, 10.0)]
         >>> filt = jl.filters.InteractingMultipleModel(tuple(modes), jnp.array([[0.9, 0.1], [0.1, 0.9]]))
         >>> state = filt.init(jl.beliefs.Gaussian(jnp.zeros(2), 0.01 * jnp.eye(2)))
-        >>> state, info = filt.update(filt.predict(state, jnp.array(1.0)), jnp.array([2.0]), jnp.array(True))
-        >>> bool(info.probabilities[1] > 0.9)
+        >>> state, history = jl.filters.run(filt, state, jnp.ones(1), jnp.array([[2.0]]), jnp.ones(1, bool))
+        >>> bool(history.infos.probabilities[0, 1] > 0.9)
         True
     """
 

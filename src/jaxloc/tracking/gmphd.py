@@ -68,11 +68,10 @@ class GmPhd(Tracker):
         >>> phd = jl.tracking.GmPhd(model, capacity=20)
         >>> state = phd.init(jl.beliefs.Mixture.empty(1, jnp.zeros(4)))
         >>> seen = jnp.array([[10.0, 20.0], [50.0, 60.0], [0.0, 0.0]])
-        >>> for _ in range(3):
-        ...     state = phd.predict(state, jnp.array(1.0))
-        ...     state, info = phd.update(state, seen, jnp.array([True, True, False]))
+        >>> scans, valid = jnp.stack([seen] * 3), jnp.array([[True, True, False]] * 3)
+        >>> state, history = jl.filters.run(phd, state, jnp.ones(3), scans, valid)
         >>> targets = phd.extract(state)
-        >>> int(targets.valid.sum()), round(float(info.count))
+        >>> int(targets.valid.sum()), round(float(history.infos.count[-1]))
         (2, 2)
     """
 
