@@ -86,11 +86,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--baseline", type=Path, default=REPOSITORY / "benchmarks" / "baseline.json", metavar="FILE")
     parser.add_argument("--gate", action="store_true", help="fail when a figure is behind the baseline")
     parser.add_argument("--smoke", action="store_true", help="small sizes, one repetition: does everything run?")
+    parser.add_argument("--list", action="store_true", help="measure nothing: print the names of the rooms")
     parser.add_argument("--readme", type=Path, metavar="FILE", help="measure nothing: fill a page from the baseline")
     options = parser.parse_args(arguments)
     if options.readme is not None:
         page = options.readme.read_text(encoding="utf-8")
         options.readme.write_text(fill(page, read(options.baseline)["metrics"]), encoding="utf-8")
+        return 0
+    if options.list:
+        print("\n".join(ROOMS))
         return 0
     rooms = tuple(options.rooms) or ROOMS
     if unknown := sorted(set(rooms) - set(ROOMS)):

@@ -78,13 +78,13 @@ def calibrations():
 
 
 def bundles():
-    """32 stereo bundles of 5 poses and 20 points: a reduced system of 30 unknowns."""
+    """24 stereo bundles of 5 poses and 8 points: a reduced system of 30 unknowns."""
     rng = np.random.default_rng(1)
-    depth = rng.uniform(4.0, 9.0, (20, 1))
-    points = jnp.asarray(np.hstack([rng.uniform(-0.4, 0.4, (20, 2)) * depth, depth]), jnp.float32)
+    depth = rng.uniform(4.0, 9.0, (8, 1))
+    points = jnp.asarray(np.hstack([rng.uniform(-0.4, 0.4, (8, 2)) * depth, depth]), jnp.float32)
     twists = jnp.asarray(np.linspace(np.zeros(6), [1.2, 0.2, 0.6, 0.05, -0.1, 0.05], 5), jnp.float32)
     truth, rig = Bundle(jax.vmap(SE3.exp)(twists), points), StereoRig(CAMERA, 0.5)
-    camera, point = (jnp.asarray(index, jnp.int32) for index in np.divmod(np.arange(100), 20))
+    camera, point = (jnp.asarray(index, jnp.int32) for index in np.divmod(np.arange(40), 8))
     frames = jax.vmap(lambda pose: pose.inverse().apply(points))(truth.poses)
     seen = rig.project(frames.reshape(-1, 3))
     tables = Observations.of(np.asarray(camera), np.asarray(point), seen, sigma=0.5)
@@ -94,7 +94,7 @@ def bundles():
         found = adjust(rig, initial, tables)
         return found.value.points, found.pose_covariance(jnp.arange(5))
 
-    return fit, normal(32, 25, 6, scale=0.02)
+    return fit, normal(24, 13, 6, scale=0.02)
 
 
 def camera_poses():

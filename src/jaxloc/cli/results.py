@@ -7,8 +7,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import jaxloc
 from jaxloc.cli import options
-from jaxloc.cli.yaml_file import load_yaml
 from jaxloc.data.io.writing import write_file
+from jaxloc.data.io.yaml_file import load_yaml
 from jaxloc.evaluation import report
 
 

@@ -130,7 +130,7 @@ class Record:
         sections.append(report.Section("Particles", text, clouds, raster=True))
         sections += self._error_section() + self._confidence_sections()
         sections.append(results.numbers_section(metrics))
-        summary = f"{metrics['scans']} scans, {metrics['scans_used']} used."
+        summary = f"{metrics['scans']} scans, {metrics['scans_used']} used. {self.log.mounting}".rstrip()
         if self.interrupted:
             summary += " Interrupted: the report ends with the last scan that was processed."
         title = f"Laser localization: {self.log.name}"

@@ -12,11 +12,12 @@ from jaxloc.cli.lifecycle import Arguments
 from jaxloc.cli.mosaic import report
 from jaxloc.data import DataError, tum
 from jaxloc.data.camera_file import read_camera
+from jaxloc.data.io.files import natural_order
+from jaxloc.data.io.images import SUFFIXES, read_gray
 from jaxloc.data.io.writing import write_file
 from jaxloc.data.tum import StampedTrajectory, planar_poses
 from jaxloc.poses.planar import planar_matrix, relative_poses
 
-_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 _LIGHTEST = 255.0
 
 
@@ -85,16 +86,18 @@ def _finish(state: Any) -> Any:
 
 
 def find_images(folder: Path) -> list[Path]:
-    """Images of a folder, in the order of their names.
+    """Images of a folder, in the order of their names and of numbers in them.
 
     Raises:
         DataError: when there is no such folder, or less than two images in it.
     """
     if not folder.is_dir():
         raise DataError(folder, "no such folder")
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _ENDINGS)
+    paths = sorted((path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES), key=natural_order)
     if len(paths) < 2:
-        raise DataError(folder, f"holds {len(paths)} images ({', '.join(_ENDINGS)}); a mosaic needs two or more")
+        raise DataError(
+            folder, f"holds {len(paths)} images ({', '.join(sorted(SUFFIXES))}); a mosaic needs two or more"
+        )
     return paths
 
 
@@ -120,10 +123,7 @@ def _read_ground(path: Path) -> tuple[Any, tuple[int, int] | None]:
 def _read_images(paths: list[Path], shape: tuple[int, int] | None) -> np.ndarray:
     images = []
     for path in paths:
-        data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
-        if image is None:
-            raise DataError(path, "is no image that can be read")
+        image = read_gray(path)
         rows, columns = image.shape if shape is None else shape
         shape = (rows, columns)
         if image.shape != shape:
