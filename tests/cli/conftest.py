@@ -51,6 +51,7 @@ class Pipeline:
     def __init__(self):
         self.used = None
         self.interrupt_at = None
+        self.signal = signal.SIGINT
         self.fail_at = None
 
     def run(self, frames: Any, config: Config, rig: Any) -> Iterator[Output]:
@@ -59,7 +60,7 @@ class Pipeline:
             if index == self.fail_at:
                 raise RuntimeError("broken")
             if index == self.interrupt_at:
-                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), self.signal)
             yield self.output(index, frame)
 
     def output(self, index: int, frame: Any) -> Output:

@@ -11,8 +11,6 @@ from jaxloc.cli import options, results, session
 from jaxloc.data import DataError
 from jaxloc.data.io.writing import RowWriter
 
-_INTERRUPTED = 130
-
 
 class Arguments(NamedTuple):
     """Arguments that every command has.
@@ -57,7 +55,7 @@ class Run:
 
     Args:
         out: folder for the results.
-        interruption: whether Ctrl-C was pressed.
+        interruption: whether SIGINT (Ctrl-C) or SIGTERM came.
     """
 
     def __init__(self, out: Path, interruption: session.Interruption):
@@ -88,7 +86,7 @@ class Run:
 
         Raises:
             DataError: there is no output.
-            typer.Abort: interrupted before the first output; nothing is left behind.
+            KeyboardInterrupt: interrupted before the first output; nothing is left behind.
         """
         count = 0
         with ExitStack() as stack:
@@ -102,7 +100,7 @@ class Run:
                     break
             if not count:
                 if self.interrupted:
-                    raise typer.Abort
+                    raise KeyboardInterrupt(self._interruption.number)
                 raise DataError(title, "the input holds nothing to process")
 
     def finish(
@@ -117,18 +115,18 @@ class Run:
             summary: a few words made of the metrics.
 
         Returns:
-            The exit code: 0, or 130 after an interrupt.
+            The exit code: 0, or 128 and the number of the signal that ended the run.
         """
         record.interrupted = self.interrupted
         metrics = results.write(record, config, self.out, inputs)
         note = ", interrupted" if self.interrupted else ""
         typer.echo(f"{summary(metrics)}{note}: {self.out / 'report.html'}")
-        return _INTERRUPTED if self.interrupted else 0
+        return self._interruption.code
 
 
 @contextmanager
 def open_run(out: Path) -> Iterator[Run]:
-    """Makes the output folder and catches Ctrl-C; a folder that was made and stays empty is removed again.
+    """Makes the output folder and catches SIGINT and SIGTERM; a folder that was made and stays empty is removed again.
 
     Args:
         out: folder for the results.

@@ -1,4 +1,4 @@
-"""Progress bar, orderly end on Ctrl-C, compilation cache, and output folder of a run."""
+"""Progress bar, orderly end on SIGINT and SIGTERM, compilation cache, and output folder of a run."""
 
 import os
 import signal
@@ -7,34 +7,50 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
+from typing import Any
 
 from jaxloc.data import DataError
 
 
 class Interruption:
-    """Turns the first Ctrl-C into a request to stop after the current frame; the second one stops at once."""
+    """Turns a first SIGINT (Ctrl-C) or SIGTERM into a request to stop after the current frame; a second stops at once.
+
+    Attributes:
+        number: of the signal; None before it.
+    """
 
     def __init__(self) -> None:
-        self.requested = False
-        self._previous = None
+        self.number: int | None = None
+        self._previous: dict[int, Any] = {}
+
+    @property
+    def requested(self) -> bool:
+        """Whether the run is to end."""
+        return self.number is not None
+
+    @property
+    def code(self) -> int:
+        """The exit code: 128 and the number of the signal, as shells have it; 0 without one."""
+        return 0 if self.number is None else 128 + self.number
 
     def __enter__(self) -> "Interruption":
         try:
-            self._previous = signal.signal(signal.SIGINT, self._request)
-        except ValueError:  # not in the main thread: Ctrl-C goes elsewhere
-            self._previous = None
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._request)
+        except ValueError:  # not in the main thread: signals go elsewhere
+            self._previous.clear()
         return self
 
     def _request(self, number: int, frame: FrameType | None) -> None:
         if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True
+            raise KeyboardInterrupt(number)
+        self.number = number
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._previous is not None:
-            signal.signal(signal.SIGINT, self._previous)
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

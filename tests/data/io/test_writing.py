@@ -39,6 +39,22 @@ def test_an_interrupt_keeps_rows_and_an_error_keeps_the_old_file(tmp_path, error
     assert [file.name for file in tmp_path.iterdir()] == ["rows.txt"]
 
 
+def test_an_interrupt_before_the_first_row_keeps_the_old_file(tmp_path):
+    path = tmp_path / "rows.txt"
+    path.write_text("before")
+    with pytest.raises(KeyboardInterrupt), RowWriter(path, header="a"):
+        raise KeyboardInterrupt
+    assert path.read_text() == "before"
+    assert [file.name for file in tmp_path.iterdir()] == ["rows.txt"]
+
+
+def test_names_that_are_not_unicode_are_written_with_escapes(tmp_path):
+    write_file(tmp_path / "a", "x\udcff")
+    with RowWriter(tmp_path / "b") as rows:
+        rows.append("x\udcff")
+    assert (tmp_path / "a").read_text() == (tmp_path / "b").read_text()[:-1] == "x\\udcff"
+
+
 def test_rows_are_refused_outside_the_block(tmp_path):
     with pytest.raises(ValueError, match="not open"):
         RowWriter(tmp_path / "a").append("1")

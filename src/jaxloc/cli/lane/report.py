@@ -104,7 +104,7 @@ class Record:
         for place, (number, image) in enumerate(self._images.items(), start=1):
             plot = figure.add_subplot(rows, columns, place)
             plot.imshow(image)
-            plot.set_title(self.names[number], fontsize=7)
+            plot.set_title(self.names[number], fontsize=7, parse_math=False)
             plot.set_axis_off()
         return figure
 

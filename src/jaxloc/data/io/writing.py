@@ -4,6 +4,7 @@ Everything is written beside its place under a temporary name and moved there in
 sees half a file and a failed run leaves the files of the run before it.
 """
 
+import contextlib
 import os
 from pathlib import Path
 from types import TracebackType
@@ -37,7 +38,9 @@ def write_file(path: Path | str, content: str | bytes) -> None:
     path = Path(path)
     temporary = _temporary(path)
     try:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        # Names of files that are not UTF-8 hold what cannot be encoded.
+        data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
+        temporary.write_bytes(data)
         os.replace(temporary, path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
@@ -47,8 +50,8 @@ def write_file(path: Path | str, content: str | bytes) -> None:
 class RowWriter:
     r"""Text file written row by row, renamed to its final name when its block ends.
 
-    An interrupt (Ctrl-C) keeps the rows written so far; any other error throws them away and leaves the file that was
-    there before.
+    An interrupt (Ctrl-C) keeps the rows written so far, if there are any; any other error throws them away and leaves
+    the file that was there before.
 
     Args:
         path: the file.
@@ -71,30 +74,54 @@ class RowWriter:
         self.path = Path(path)
         self._header = header
         self._file: TextIO | None = None
+        self._rows = 0
 
     def __enter__(self) -> "RowWriter":
         try:
-            self._file = _temporary(self.path).open("w", encoding="utf-8", newline="\n")
+            self._file = _temporary(self.path).open("w", encoding="utf-8", errors="backslashreplace", newline="\n")
         except OSError as error:
             raise DataError(self.path, f"cannot be written: {error.strerror}") from error
         if self._header is not None:
-            self.append(self._header)
+            try:
+                self._write(self._header)
+            except DataError:
+                self._discard()
+                raise
         return self
 
     def append(self, row: str) -> None:
         """Adds a row; it is in the file when this returns."""
         if self._file is None:
             raise ValueError(f"{self.path} is not open: append rows inside the writer's with block.")
-        self._file.write(f"{row}\n")
-        self._file.flush()
+        self._write(row)
+        self._rows += 1
+
+    def _write(self, line: str) -> None:
+        assert self._file is not None
+        try:
+            self._file.write(f"{line}\n")
+            self._file.flush()
+        except OSError as error:
+            raise DataError(self.path, f"cannot be written: {error.strerror}") from error
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-        if kind is None or issubclass(kind, KeyboardInterrupt | GeneratorExit):
+        if kind is not None and not (self._rows and issubclass(kind, KeyboardInterrupt | GeneratorExit)):
+            self._discard()
+            return
+        try:
+            if self._file is not None:
+                self._file.close()
             os.replace(_temporary(self.path), self.path)
-        else:
-            _temporary(self.path).unlink(missing_ok=True)
+        except OSError as failure:
+            self._discard()
+            raise DataError(self.path, f"cannot be written: {failure.strerror}") from failure
+        self._file = None
+
+    def _discard(self) -> None:
+        if self._file is not None:
+            with contextlib.suppress(OSError):  # what is still to be written does not fit on a full disk
+                self._file.close()
+            self._file = None
+        _temporary(self.path).unlink(missing_ok=True)

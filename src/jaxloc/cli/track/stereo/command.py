@@ -35,7 +35,7 @@ def run_recording(folder: Path, poses: Path | None, arguments: Arguments) -> int
         arguments: output folder and options.
 
     Returns:
-        Exit code: 0, or 130 after an interrupt, when the rows, metrics and report end with the last whole frame.
+        Exit code: 0, or 130 or 143 after an interrupt, when the rows, metrics and report end with the last whole frame.
 
     Raises:
         DataError: when the recording, the poses or the options are bad; nothing is written then.
