@@ -11,7 +11,7 @@ from types import FrameType
 
 __all__ = ["main", "run"]
 
-_BAD_INPUT = 2
+_BAD_INPUT, _INTERRUPTED = 2, 130
 _FEWEST_THREADS = 8
 
 
@@ -44,24 +44,21 @@ def run(arguments: list[str]) -> int:
         return _fail(f'the command line needs {error.name}: pip install "jaxloc[cli]"')
     try:
         return int(app(args=arguments or ["--help"], prog_name="jaxloc", standalone_mode=False) or 0)
-    except KeyboardInterrupt as interrupt:
-        return _interrupted(interrupt)
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except SystemExit as interrupt:
+        return int(interrupt.code or 0)
     except BrokenPipeError:
         # The reader of the output closed it, as `head` does: print nothing more.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
-        if type(error).__name__ == "Abort":  # the command line parser makes it of an interrupt
-            return _interrupted(error.__cause__)
+        if type(error).__name__ == "Abort":
+            return _INTERRUPTED
         message = _describe(error)
         if message is None:
             raise
         return _fail(message)
-
-
-def _interrupted(error: BaseException | None) -> int:
-    """The exit code as shells have it: 128 and the number of the signal."""
-    return 128 + (error.args[0] if error is not None and error.args else signal.SIGINT)
 
 
 def _leave(number: int, frame: FrameType | None) -> None:

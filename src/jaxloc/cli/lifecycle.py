@@ -86,7 +86,7 @@ class Run:
 
         Raises:
             DataError: there is no output.
-            KeyboardInterrupt: interrupted before the first output; nothing is left behind.
+            SystemExit: interrupted before the first output; nothing is left behind.
         """
         count = 0
         with ExitStack() as stack:
@@ -100,7 +100,7 @@ class Run:
                     break
             if not count:
                 if self.interrupted:
-                    raise KeyboardInterrupt(self._interruption.number)
+                    raise SystemExit(self._interruption.code)
                 raise DataError(title, "the input holds nothing to process")
 
     def finish(

@@ -43,7 +43,7 @@ class Interruption:
 
     def _request(self, number: int, frame: FrameType | None) -> None:
         if self.requested:
-            raise KeyboardInterrupt(number)
+            raise SystemExit(128 + number)
         self.number = number
 
     def __exit__(

@@ -50,7 +50,7 @@ def write_file(path: Path | str, content: str | bytes) -> None:
 class RowWriter:
     r"""Text file written row by row, renamed to its final name when its block ends.
 
-    An interrupt (Ctrl-C) keeps the rows written so far, if there are any; any other error throws them away and leaves
+    An interrupt (Ctrl-C, or the end of the program) keeps the rows written so far, if there are any; any other error throws them away and leaves
     the file that was there before.
 
     Args:
@@ -107,7 +107,7 @@ class RowWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None and not (self._rows and issubclass(kind, KeyboardInterrupt | GeneratorExit)):
+        if kind is not None and not (self._rows and issubclass(kind, KeyboardInterrupt | SystemExit | GeneratorExit)):
             self._discard()
             return
         try:
