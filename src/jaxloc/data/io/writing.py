@@ -50,8 +50,8 @@ def write_file(path: Path | str, content: str | bytes) -> None:
 class RowWriter:
     r"""Text file written row by row, renamed to its final name when its block ends.
 
-    An interrupt (Ctrl-C, or the end of the program) keeps the rows written so far, if there are any; any other error throws them away and leaves
-    the file that was there before.
+    An interrupt (Ctrl-C, or the end of the program) keeps the rows written so far, if there are any; any other error
+    throws them away and leaves the file that was there before.
 
     Args:
         path: the file.
