@@ -36,6 +36,31 @@ def neutral(value: Any) -> Any:
     return jax.tree.map(replace, value, is_leaf=lambda node: isinstance(node, Group | Direction))
 
 
+def finite_or_neutral(value: Any) -> Any:
+    """The pytree with zero in place of non-finite numbers, and the identity in place of poses that hold one.
+
+    Example:
+        >>> import jax.numpy as jnp, jaxloc as jl
+        >>> pose, speed = finite_or_neutral((jl.poses.SE2(1.0, 2.0, jnp.nan), jnp.array([jnp.nan, 1.0])))
+        >>> float(pose.x), float(pose.theta), speed.tolist()
+        (0.0, 0.0, [0.0, 1.0])
+    """
+
+    def replace(node):
+        if not isinstance(node, Group | Direction):
+            return tree.finite_or_zero(node)
+        depth = len(node.batch_shape)
+        good = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(depth, leaf.ndim))) for leaf in jax.tree.leaves(node)]
+        good = jnp.all(jnp.stack(good), axis=0)
+
+        def choose(leaf, other):
+            return jnp.where(good.reshape(*good.shape, *(1,) * (leaf.ndim - depth)), leaf, other)
+
+        return jax.tree.map(choose, node, neutral(node))
+
+    return jax.tree.map(replace, value, is_leaf=lambda node: isinstance(node, Group | Direction))
+
+
 def is_covariance(matrix: Float[Array, "d d"]) -> Bool[Array, ""]:
     """Whether a matrix is finite, within range, and positive semidefinite up to rounding; without derivatives.
 

@@ -112,7 +112,7 @@ class HistogramFilter(Filter):
     def predict(self, state: HistogramState, control: Any, *, key: Key[Array, ""] | None = None) -> HistogramState:
         """The state one step ahead: mass moves between cells by the transition density."""
         del key
-        points, control = state.cells.points, tree.finite_or_zero(control)
+        points, control = state.cells.points, validity.finite_or_neutral(control)
 
         def transition(point):
             shares = jax.vmap(lambda target: self.motion.log_prob(point, control, target))(points)

@@ -114,7 +114,7 @@ class InformationFilter(Filter):
     def predict(self, state: InformationState, control: Any, *, key: Key[Array, ""] | None = None) -> InformationState:
         """The state one step ahead; non-finite entries of the control count as zero."""
         del key
-        ok, after = tree.protect(_moved, self, state, tree.finite_or_zero(control))
+        ok, after = tree.protect(_moved, self, state, validity.finite_or_neutral(control))
         return tree.where(ok, after, InformationState(state.information_sqrt, state.target, state.step + 1))
 
     def move(self, state: InformationState, control: Any) -> InformationState:

@@ -9,7 +9,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
-from jaxloc.beliefs import Gaussian
+from jaxloc.beliefs import Gaussian, validity
 from jaxloc.beliefs.square_root import cholesky, product, triangularize, whiten
 from jaxloc.filters.interface import Filter, FilterState, GaussianInfo, GaussianState, History, Info, conclude
 from jaxloc.filters.kalman import GaussianFilter, retract_root
@@ -116,7 +116,7 @@ class InteractingMultipleModel(Filter):
     def predict(self, state: InteractingState, control: Any, *, key: Key[Array, ""] | None = None) -> InteractingState:
         """The state one step ahead: mixed for each mode, then predicted by its filter."""
         del key
-        ok, moved = tree.protect(_moved, self, state, tree.finite_or_zero(control))
+        ok, moved = tree.protect(_moved, self, state, validity.finite_or_neutral(control))
         held = _renumber(state.states, state.step + 1)
         return tree.where(ok, moved, InteractingState(held, state.log_probabilities, state.step + 1))
 
@@ -206,7 +206,7 @@ def smooth_interacting(
     mask = jnp.ones(states.step.shape[:1], bool) if active is None else active
     last = jax.tree.map(lambda leaf: leaf[-1], states)
     before = jax.tree.map(lambda leaf: leaf[:-1], states)
-    after = jax.tree.map(lambda leaf: leaf[1:], (tree.finite_or_zero(controls), mask))
+    after = jax.tree.map(lambda leaf: leaf[1:], (validity.finite_or_neutral(controls), mask))
 
     def back(smoothed, inputs):
         state, (control, here) = inputs

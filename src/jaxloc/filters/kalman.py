@@ -132,12 +132,12 @@ class GaussianFilter(Filter):
         return GaussianState(mean, cholesky(covariance), jnp.zeros((), jnp.int32))
 
     def predict(self, state: GaussianState, control: Any, *, key: Key[Array, ""] | None = None) -> GaussianState:
-        """The state one step ahead; non-finite entries of the control count as zero.
+        """The state one step ahead; non-finite entries of the control count as zero, or as no motion.
 
         A prediction beyond the range of numbers leaves the state unchanged, but for its step.
         """
         del key
-        ok, moved = tree.protect(_moved, self, state, tree.finite_or_zero(control))
+        ok, moved = tree.protect(_moved, self, state, validity.finite_or_neutral(control))
         return tree.where(ok, moved, GaussianState(state.mean, state.covariance_sqrt, state.step + 1))
 
     def update(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
-from jaxloc.beliefs import Closeness, Mixture, Motion, reduce_mixture
+from jaxloc.beliefs import Closeness, Mixture, Motion, reduce_mixture, validity
 from jaxloc.filters import GaussianState
 from jaxloc.filters.kalman import linearized_motion
 from jaxloc.poses.lie_group import as_floats
@@ -89,7 +89,7 @@ def predict(
     References:
         Vo and Ma 2006, eqs. 24-27 [T-75].
     """
-    control = tree.finite_or_zero(control)
+    control = validity.finite_or_neutral(control)
     zero = jnp.zeros((), jnp.int32)
     states = jax.vmap(lambda mean, root: GaussianState(mean, root, zero))(mixture.means, mixture.roots())
     moved = jax.vmap(lambda state: model.filter.predict(state, control))(states)
