@@ -180,9 +180,7 @@ def _of_density(mean: Array, covariance: Array) -> tuple[Bool[Array, ""], Inform
     return tree.within_range(state.target) & tree.all_finite((state, state.mean)), state
 
 
-def _moved(
-    filt: InformationFilter, state: InformationState, control: Any
-) -> tuple[Bool[Array, ""], InformationState]:
+def _moved(filt: InformationFilter, state: InformationState, control: Any) -> tuple[Bool[Array, ""], InformationState]:
     after = filt.move(state, control)
     return tree.within_range((state.target, after.target)) & tree.all_finite(after), after
 

@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
 from jaxloc.beliefs.square_root import cholesky, product, triangularize
@@ -69,11 +69,8 @@ class ProbabilisticDataAssociation(TrackTable, Tracker):
     def __check_init__(self):
         require_gaussian(self.model, "ProbabilisticDataAssociation")
 
-    def update(
-        self, state: Tracks, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
-    ) -> tuple[Tracks, TrackerInfo]:
+    def associate_scan(self, state: Tracks, measurement: Any, valid: Bool[Array, " m"]) -> tuple[Tracks, TrackerInfo]:
         """The tracks given a scan."""
-        del key
         scan = compare_scan(self.model, state, measurement, valid, self.gate)
         return update_tracks(state, scan, associate_alone(scan.log_odds, scan.log_missed), self.logic)
 
@@ -133,8 +130,7 @@ def update_tracks(state: Tracks, scan: Scan, found: Association, logic: TrackLog
     newborn = jnp.where(unexplained > 0.5, unexplained * scan.share, 0.0)
     after, crowded = manage_tracks(aged, scan.newborn.states, newborn, logic)
     likelihood = scan.base + found.log_normalizer
-    ok = tree.all_finite((after, likelihood))
-    after = tree.where(ok, after, state)
+    ok = tree.all_finite((after, likelihood)) & scan.usable
     return after, TrackerInfo(jnp.where(ok, likelihood, 0.0), ok, jnp.sum(after.existence), crowded)
 
 
