@@ -136,7 +136,7 @@ def protect(function: Callable[..., tuple[Bool[Array, ""], Any]], *args: Any) ->
     hoisted, closed_over = jax.closure_convert(flat, *leaves)
     step = jax.custom_jvp(hoisted)
     step.defjvp(lambda primals, tangents: _cut_jvp(hoisted, primals, tangents), symbolic_zeros=True)
-    return step(*leaves, *closed_over)
+    return jax.tree.map(jnp.asarray, step(*leaves, *closed_over))
 
 
 def _cut_jvp(function: Callable, primals: tuple, tangents: tuple) -> tuple[Any, Any]:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
-from jaxloc.beliefs import Gaussian, Motion, Sensor
+from jaxloc.beliefs import Gaussian, Motion, Sensor, validity
 from jaxloc.beliefs.models import innovation
 from jaxloc.filters.interface import Filter, FilterState, Info
 from jaxloc.filters.unscented import intrinsic_mean

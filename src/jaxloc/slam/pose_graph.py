@@ -144,8 +144,8 @@ def optimize(
 
     Returns:
         Estimate of all poses, the first with zero covariance. Its covariance is that of the stacked tangents, pose by
-        pose ("n d" x "n d"). Not ok where edges do not tie every pose to the first one, or an initial pose is none. Derivatives by measurements and
-        the first pose are those of the solution.
+        pose ("n d" x "n d"). Not ok where edges do not tie every pose to the first one, or an initial pose is none.
+        Derivatives by measurements and the first pose are those of the solution.
 
     Raises:
         ValueError: there are fewer than two poses, or covariances of another size than the poses' tangents.
