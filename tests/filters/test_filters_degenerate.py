@@ -71,13 +71,7 @@ BASE = {
     "valid": jnp.array(True),
 }
 UNSUPPORTED = lanes.unusable("mean", "cov") | {"cov=-1", "cov indefinite"}
-SLOW = {
-    "InteractingMultipleModel",
-    "SigmaPointFilter",
-    "SigmaPointFilter, cubature",
-    "ParticleFilter, guided",
-    "ParticleFilter, auxiliary and guided",
-}
+SLOW = {*GAUSSIAN, *PROPOSALS} - {"KalmanFilter, gate", "InformationFilter"}
 
 
 def test_every_filter_is_here():

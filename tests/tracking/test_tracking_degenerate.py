@@ -49,14 +49,14 @@ BASE = {
     "z": jnp.array([[1.2, 2.1], [30.0, 5.0], [0.0, 0.0]]),
     "valid": jnp.array([True, True, False]),
 }
-SLOW = set(TRACKERS) - {"GlobalNearestNeighbor"}
 
 
 def test_every_tracker_is_here():
     assert set(lanes.concrete(T, T.Tracker)) == set(TRACKERS)
 
 
-@pytest.mark.parametrize("name", [lanes.marked(name, SLOW) for name in TRACKERS])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TRACKERS)
 def test_steps(name):
     def step(p):
         tracker = TRACKERS[name](p)
@@ -93,6 +93,14 @@ def test_a_sentinel_is_an_absent_measurement(name):
     np.testing.assert_array_equal(counts[:, -1], 2)
 
 
+def test_huge_and_nonfinite_measurements_are_absent():
+    given = jnp.array([[1.0, 2.0], [jnp.nan, 0.0], [1e20, 1.0], [lanes.LARGEST, 0.0], [3.0, 4.0]])
+    usable = T.gating.usable_measurements(given, jnp.ones(5, bool).at[4].set(False))
+    assert usable.tolist() == [True, False, False, False, False]
+    np.testing.assert_array_equal(T.gating.safe_measurements(given, usable)[1:], 0.0)
+
+
+@pytest.mark.slow
 def test_cphd_has_finite_derivatives_with_empty_slots():
     scans = jnp.array([[[0.0, 0.0], [3.0, 0.0], [7.0, 7.0]]]).repeat(3, axis=0)
 

@@ -122,7 +122,8 @@ def update_tracks(state: Tracks, scan: Scan, found: Association, logic: TrackLog
     left = miss(state.existence, scan.detection)
     hit = 1.0 - found.missed
     existence = hit + found.missed * left
-    divisor = jnp.where(existence > 0.0, existence, 1.0)
+    # The derivative by an existence of nearly zero overflows; such tracks are deleted.
+    divisor = jnp.where(existence > 1.0 / tree.largest(existence.dtype), existence, 1.0)
     moved = match_moments(state.states, scan.comparison, found.pairs / divisor[:, None])
     states = jax.vmap(tree.where)(jnp.any(found.pairs > 0.0, axis=1), moved, state.states)
     aged = age_tracks(state, states, existence, hit > 0.5)
