@@ -12,6 +12,7 @@ from jaxloc.beliefs import (
     propagation,
     resampling,
     square_root,
+    validity,
 )
 from jaxloc.beliefs.compounding import compose, invert, relative
 from jaxloc.beliefs.gates import chi2_cdf, chi2_quantile, gate
@@ -55,4 +56,5 @@ __all__ = [
     "relative",
     "resampling",
     "square_root",
+    "validity",
 ]

@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
+from jaxloc.beliefs import validity
 from jaxloc.beliefs.square_root import cholesky, solve, whiten
 from jaxloc.poses import local, retract, tangent_dimension
 
@@ -84,7 +86,8 @@ def fuse(a: Gaussian, b: Gaussian) -> Gaussian:
     """Information fusion: the normalized product of two densities of one vector.
 
     Computed as ``m = m_a + K (m_b - m_a)`` with ``K = P_a (P_a + P_b)^-1`` and the Joseph form, which needs no inverse
-    of either covariance and keeps the result positive semidefinite.
+    of either covariance and keeps the result positive semidefinite. A density that is none (with a non-finite number or
+    an indefinite covariance) has no weight: the result is the other one, or `validity.unknown` where both are none.
 
     Args:
         a: density with a vector mean "d".
@@ -108,10 +111,21 @@ def fuse(a: Gaussian, b: Gaussian) -> Gaussian:
     """
     _require_vector(a, "fuse")
     _require_vector(b, "fuse")
+    pairs = (a.mean, a.covariance), (b.mean, b.covariance)
+    good = [validity.usable(*pair) for pair in pairs]
+    safe = [tree.where(fine, pair, validity.unknown(*pair)) for fine, pair in zip(good, pairs, strict=True)]
+    _, both = tree.protect(_product, *safe)
+    return Gaussian(*tree.where(good[0] & good[1], both, tree.where(good[0], safe[0], safe[1])))
+
+
+def _product(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+    """Mean and covariance of the product of two densities, and whether they are finite."""
+    a, b = Gaussian(*one), Gaussian(*other)
     gain = solve(cholesky(a.covariance + b.covariance), a.covariance).T
     rest = jnp.eye(a.dimension, dtype=gain.dtype) - gain
     covariance = matmul(matmul(rest, a.covariance), rest.T) + matmul(matmul(gain, b.covariance), gain.T)
-    return Gaussian(a.mean + matmul(gain, b.mean - a.mean), covariance)
+    fused = a.mean + matmul(gain, b.mean - a.mean), covariance
+    return tree.all_finite(fused), fused
 
 
 def _require_vector(gaussian: Gaussian, verb: str) -> None:

@@ -6,10 +6,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
+from jaxloc.beliefs import validity
 from jaxloc.beliefs.gaussian import Gaussian
 from jaxloc.beliefs.square_root import cholesky
 from jaxloc.poses import is_flat, local, retract, tangent_dimension
@@ -81,6 +84,23 @@ class Mixture(eqx.Module):
             place = int(np.argmax(negative))
             raise ValueError(f"Covariance {place} of a mixture has the negative eigenvalue {values[place].min():.3g}.")
         return self
+
+    def usable(self) -> "Mixture":
+        """The mixture without components that hold non-finite numbers or numbers that overflow: their slots are empty.
+
+        Example:
+            >>> import jax.numpy as jnp, jaxloc as jl
+            >>> means = jnp.array([[0.0], [jnp.nan], [2.0]])
+            >>> mixture = jl.beliefs.Mixture(jnp.array([1.0, 1.0, jnp.inf]), means, jnp.ones((3, 1, 1)))
+            >>> mixture.usable().weights.tolist(), mixture.usable().means[:, 0].tolist()
+            ([1.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+        """
+        scales = jnp.sqrt(jnp.abs(lax.stop_gradient(self.covariances)))
+        good = tree.slots_within_range((self.weights, self.means, scales))
+        size = self.covariances.shape[-1]
+        eye = jnp.broadcast_to(jnp.eye(size, dtype=self.covariances.dtype), self.covariances.shape)
+        empty = Mixture(jnp.zeros_like(self.weights), validity.neutral(self.means), eye, self.labels)
+        return jax.vmap(tree.where)(good, self, empty)
 
     @property
     def capacity(self) -> int:

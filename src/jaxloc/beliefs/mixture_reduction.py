@@ -95,7 +95,7 @@ def reduce_mixture(
     Merging matches moments (the dispersion of the means included), so that mass, mean and covariance are kept.
 
     Args:
-        mixture: any number of components.
+        mixture: any number of components; those with non-finite numbers count as absent.
         capacity: slots of the result.
         prune: weights below it are dropped.
         closeness: which components are merged.
@@ -114,6 +114,7 @@ def reduce_mixture(
         >>> jl.beliefs.mixture_reduction.reduce_mixture(many, 2).mixture.weights.round(3).tolist()
         [1.0, 0.5]
     """
+    mixture = mixture.usable()
     num = min(mixture.capacity, mixture.capacity if candidates is None else candidates)
     heavy = mixture.valid & (mixture.weights >= jnp.asarray(prune, mixture.weights.dtype))
     weights, order = lax.top_k(jnp.where(heavy, mixture.weights, 0.0), num)

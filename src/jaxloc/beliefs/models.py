@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc._linalg import matmul
+from jaxloc.beliefs import validity
 from jaxloc.beliefs.square_root import cholesky, whiten
 from jaxloc.poses import local, retract, tangent_dimension
 
@@ -90,7 +91,7 @@ class Sensor(eqx.Module):
         return _linearize(lambda x: self.expect(x, measurement), state)
 
     def log_prob(self, state: Any, measurement: Any, valid: Bool[Array, "*m"]) -> Float[Array, ""]:
-        """Log density of a measurement; invalid and non-finite entries are ignored.
+        """Log density of a measurement; invalid and non-finite entries are ignored; NaN without a covariance.
 
         Args:
             state: state at which it is evaluated.
@@ -98,7 +99,9 @@ class Sensor(eqx.Module):
             valid: one Boolean, or one for each tangent direction of the measurement.
         """
         residual, mask = innovation(self.expect(state, measurement), measurement, valid)
-        return log_normal(residual, self.covariance(state, measurement), mask)
+        covariance = self.covariance(state, measurement)
+        density = log_normal(residual, covariance, mask)
+        return jnp.where(validity.is_covariance(mask_covariance(covariance, mask)), density, jnp.nan)
 
 
 def innovation(

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
+from jaxloc.beliefs import validity
 from jaxloc.beliefs.gaussian import Gaussian
 from jaxloc.beliefs.models import dtype_of
 from jaxloc.poses import SE2, SE3, SO2, SO3, local, retract
@@ -54,8 +55,11 @@ class Particles(eqx.Module):
 
     @staticmethod
     def from_gaussian(gaussian: Gaussian, num_particles: int, *, key: Key[Array, ""]) -> "Particles":
-        """Equally weighted particles sampled from a normal density."""
-        return Particles(gaussian.sample(num_particles, key=key))
+        """Equally weighted particles sampled from a normal density; none is valid where it is no density."""
+        mean, covariance = validity.usable_or_unknown(gaussian.mean, gaussian.covariance)
+        values = Gaussian(mean, covariance).sample(num_particles, key=key)
+        good = jnp.full(num_particles, validity.usable(gaussian.mean, gaussian.covariance))
+        return Particles(values, valid=good)
 
     @staticmethod
     def uniform(
@@ -73,6 +77,19 @@ class Particles(eqx.Module):
         fraction = jax.random.uniform(key, (num_particles, 3), lower.dtype)
         xy = lower[None, :] + fraction[:, :2] * (upper - lower)[None, :]
         return Particles(jax.vmap(SE2)(xy[:, 0], xy[:, 1], jnp.pi * (2.0 * fraction[:, 2] - 1.0)))
+
+    def usable(self) -> "Particles":
+        """The particles without values that are not finite or overflow: their slots are not valid.
+
+        Example:
+            >>> import jax.numpy as jnp, jaxloc as jl
+            >>> jl.beliefs.Particles(jnp.array([[1.0], [jnp.nan]])).usable().valid.tolist()
+            [True, False]
+        """
+        good = tree.slots_within_range(self.values)
+        return Particles(
+            jax.vmap(tree.where)(good, self.values, validity.neutral(self.values)), self.log_weights, self.valid & good
+        )
 
     @property
     def size(self) -> int:

@@ -20,7 +20,7 @@ def cholesky(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """Lower triangular ``L`` with ``L L^T = covariance``.
 
     The matrix is scaled to unit diagonal and its pivots are kept above rounding (``d eps``), so that a covariance which
-    is singular, or indefinite by rounding, still has a finite root with finite gradients.
+    is singular, or indefinite by rounding, still has a finite root with finite gradients. Non-finite entries give NaN.
 
     Args:
         covariance: "d d", symmetric; the lower triangle is read.
@@ -39,7 +39,9 @@ def cholesky(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
     info = jnp.finfo(covariance.dtype)
     size = covariance.shape[0]
     floor = size * float(info.eps)
-    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), float(info.tiny) ** 0.5))
+    variances = jnp.diagonal(covariance)
+    variances = jnp.where(variances > -jnp.inf, variances, jnp.nan)
+    scale = jnp.sqrt(jnp.maximum(variances, float(info.tiny) ** 0.5))
     correlation = covariance / scale[:, None] / scale[None, :]
     if size > _linalg.UNROLLED:  # the library's factorization has no floor of its own
         correlation = correlation + floor * jnp.eye(size, dtype=covariance.dtype)

@@ -4,7 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float
 
 from jaxloc.beliefs import Motion, Sensor
 from jaxloc.beliefs.models import innovation
@@ -87,11 +87,10 @@ class ExtendedKalmanFilter(GaussianFilter):
         """By the derivative of the sensor at the mean."""
         return linearized_innovation(self.sensor, state, measurement, valid)
 
-    def update(
-        self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
+    def correct_by(
+        self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]
     ) -> tuple[GaussianState, GaussianInfo]:
-        """The state updated by a measurement."""
-        del key
+        """The state updated by a measurement: Gauss-Newton steps of `update`."""
         found = self.innovation(state, measurement, valid)
         root = found.joint.root()
         info = innovation_info(root, found, self.gate)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
-from jaxloc.beliefs import Gaussian, Motion, Sensor
+from jaxloc.beliefs import Gaussian, Motion, Sensor, validity
 from jaxloc.beliefs.models import innovation
 from jaxloc.filters.interface import Filter, FilterState, Info
 from jaxloc.filters.unscented import intrinsic_mean
@@ -112,7 +112,7 @@ class HistogramFilter(Filter):
     def predict(self, state: HistogramState, control: Any, *, key: Key[Array, ""] | None = None) -> HistogramState:
         """The state one step ahead: mass moves between cells by the transition density."""
         del key
-        points, control = state.cells.points, tree.finite_or_zero(control)
+        points, control = state.cells.points, validity.finite_or_neutral(control)
 
         def transition(point):
             shares = jax.vmap(lambda target: self.motion.log_prob(point, control, target))(points)

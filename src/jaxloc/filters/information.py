@@ -10,11 +10,13 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxloc import _linalg
 from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
-from jaxloc.beliefs import Gaussian, Motion, Sensor
+from jaxloc.beliefs import Gaussian, Motion, Sensor, validity
 from jaxloc.beliefs.models import innovation
 from jaxloc.beliefs.square_root import cholesky, solve, triangularize, whiten
-from jaxloc.filters.interface import Filter, FilterState, GaussianState, Info
-from jaxloc.filters.kalman import noise_root
+from jaxloc.filters.interface import Filter, FilterState, GaussianState, Info, conclude
+from jaxloc.filters.kalman import noise_root, process_root
+
+_LARGEST_ROUNDING = 10.0  # of a whitened measurement, in sigmas
 
 
 class InformationState(FilterState):
@@ -95,11 +97,15 @@ class InformationFilter(Filter):
     sensor: Sensor
 
     def init(self, prior: Gaussian | GaussianState) -> InformationState:
-        """The initial state of a prior density of a vector."""
-        root = cholesky(prior.covariance)
-        # S^-1 is lower triangular; the equations S^-1 x = S^-1 m are brought to triangular form.
-        inverse = _inverse(root)
-        return _reduce(inverse, matmul(inverse, prior.mean), jnp.zeros((), jnp.int32))[0]
+        """The initial state of a prior density of a vector.
+
+        Where the prior is no density, the state holds no information, and its updates are not ``ok``.
+        """
+        mean, covariance = validity.usable_or_unknown(prior.mean, prior.covariance)
+        ok, state = tree.protect(_of_density, mean, covariance)
+        ok = ok & validity.usable(prior.mean, prior.covariance)
+        beyond = jnp.full_like(mean, 1.01 * tree.largest(mean.dtype))
+        return tree.where(ok, state, InformationState(jnp.zeros_like(covariance), beyond, state.step))
 
     def init_uninformative(self, size: int, dtype: Any = float) -> InformationState:
         """The initial state of a vector without any prior information."""
@@ -108,9 +114,14 @@ class InformationFilter(Filter):
     def predict(self, state: InformationState, control: Any, *, key: Key[Array, ""] | None = None) -> InformationState:
         """The state one step ahead; non-finite entries of the control count as zero."""
         del key
-        control, mean = tree.finite_or_zero(control), state.mean
+        ok, after = tree.protect(_moved, self, state, validity.finite_or_neutral(control))
+        return tree.where(ok, after, InformationState(state.information_sqrt, state.target, state.step + 1))
+
+    def move(self, state: InformationState, control: Any) -> InformationState:
+        """`predict` without protection from non-finite numbers, which `predict` adds."""
+        mean = state.mean
         moved, transition = self.motion.linearize(mean, control)
-        noise = cholesky(self.motion.covariance(mean, control))
+        noise = process_root(self.motion.covariance(mean, control))
         size = mean.shape[0]
         # With x = F^-1 (x' - shift - noise w): equations in (w, x'), of which w is eliminated.
         shift = moved - matmul(transition, mean)
@@ -120,16 +131,20 @@ class InformationFilter(Filter):
         right = jnp.concatenate([jnp.zeros_like(mean), state.target + matmul(rows, shift)])
         root = triangularize(jnp.concatenate([left, right[:, None]], axis=1).T)
         block = slice(size, 2 * size)
-        after = InformationState(root[block, block], root[2 * size, block], state.step + 1)
-        return tree.where(
-            tree.all_finite(after), after, InformationState(state.information_sqrt, state.target, state.step + 1)
-        )
+        return InformationState(root[block, block], root[2 * size, block], state.step + 1)
 
     def update(
         self, state: InformationState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[InformationState, InformationInfo]:
-        """The state updated by a measurement."""
+        """The state updated by a measurement; not ``ok`` where noise is so small that only rounding is left of it."""
         del key
+        ok, (after, info) = tree.protect(_updated, self, state, measurement, valid)
+        return conclude(ok, after, info, state)
+
+    def correct_by(
+        self, state: InformationState, measurement: Any, valid: Bool[Array, "*m"]
+    ) -> tuple[InformationState, InformationInfo]:
+        """`update` without protection from non-finite numbers, which `update` adds."""
         mean = state.mean
         expected, matrix = self.sensor.linearize(mean, measurement)
         residual, mask = innovation(expected, measurement, valid)
@@ -137,7 +152,8 @@ class InformationFilter(Filter):
         noise, mask = noise_root(self.sensor.covariance(mean, measurement), mask)
         matrix = whiten(noise, jnp.where(mask[:, None], matrix, 0.0))
         target = whiten(noise, jnp.where(mask, residual, 0.0)) + matmul(matrix, mean)
-        usable = jnp.isfinite(jnp.sum(lax.stop_gradient(target) ** 2))
+        rounding = float(jnp.finfo(target.dtype).eps) * jnp.max(jnp.abs(lax.stop_gradient(target)), initial=0.0)
+        usable = rounding < _LARGEST_ROUNDING
         matrix, target = jnp.where(usable, matrix, 0.0), jnp.where(usable, target, 0.0)
         rows = jnp.concatenate([state.information_sqrt.T, matrix])
         after, misfit = _reduce(rows, jnp.concatenate([state.target, target]), state.step)
@@ -155,6 +171,25 @@ class InformationFilter(Filter):
         likelihood = -0.5 * nis - volume - 0.5 * math.log(2.0 * math.pi) * seen.astype(nis.dtype)
         counts = ok & before.determined & (seen > 0)
         return InformationInfo(jnp.where(counts, likelihood, 0.0), ok, nis, seen - gained)
+
+
+def _of_density(mean: Array, covariance: Array) -> tuple[Bool[Array, ""], InformationState]:
+    # S^-1 is lower triangular; the equations S^-1 x = S^-1 m are brought to triangular form.
+    inverse = _inverse(cholesky(covariance))
+    state = _reduce(inverse, matmul(inverse, mean), jnp.zeros((), jnp.int32))[0]
+    return tree.within_range(state.target) & tree.all_finite((state, state.mean)), state
+
+
+def _moved(filt: InformationFilter, state: InformationState, control: Any) -> tuple[Bool[Array, ""], InformationState]:
+    after = filt.move(state, control)
+    return tree.within_range((state.target, after.target)) & tree.all_finite(after), after
+
+
+def _updated(
+    filt: InformationFilter, state: InformationState, measurement: Any, valid: Bool[Array, "*m"]
+) -> tuple[Bool[Array, ""], tuple[InformationState, InformationInfo]]:
+    after, info = filt.correct_by(state, measurement, valid)
+    return info.ok & tree.within_range(state.target), (after, info)
 
 
 def _reduce(rows: Float[Array, "k d"], target: Float[Array, " k"], step: Array) -> tuple[InformationState, Array]:

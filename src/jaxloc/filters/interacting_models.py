@@ -9,9 +9,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
-from jaxloc.beliefs import Gaussian
+from jaxloc.beliefs import Gaussian, validity
 from jaxloc.beliefs.square_root import cholesky, product, triangularize, whiten
-from jaxloc.filters.interface import Filter, FilterState, GaussianInfo, GaussianState, History, Info
+from jaxloc.filters.interface import Filter, FilterState, GaussianInfo, GaussianState, History, Info, conclude
 from jaxloc.filters.kalman import GaussianFilter, retract_root
 from jaxloc.filters.smoothers import ReverseStep, regression, smooth_step
 from jaxloc.filters.unscented import intrinsic_mean
@@ -116,6 +116,12 @@ class InteractingMultipleModel(Filter):
     def predict(self, state: InteractingState, control: Any, *, key: Key[Array, ""] | None = None) -> InteractingState:
         """The state one step ahead: mixed for each mode, then predicted by its filter."""
         del key
+        ok, moved = tree.protect(_moved, self, state, validity.finite_or_neutral(control))
+        held = _renumber(state.states, state.step + 1)
+        return tree.where(ok, moved, InteractingState(held, state.log_probabilities, state.step + 1))
+
+    def move(self, state: InteractingState, control: Any) -> InteractingState:
+        """`predict` without protection from non-finite mode probabilities, which `predict` adds."""
         joint = state.log_probabilities[:, None] + log_probability(self.transition)
         predicted = jax.nn.logsumexp(joint, axis=0)
         weights = jnp.exp(joint - predicted[None, :])
@@ -128,6 +134,13 @@ class InteractingMultipleModel(Filter):
     ) -> tuple[InteractingState, InteractingInfo]:
         """The state updated by a measurement."""
         del key
+        ok, (after, info) = tree.protect(_updated, self, state, measurement, valid)
+        return conclude(ok, after, info, state)
+
+    def correct_by(
+        self, state: InteractingState, measurement: Any, valid: Bool[Array, "*m"]
+    ) -> tuple[InteractingState, InteractingInfo]:
+        """`update` without protection from non-finite mode probabilities, which `update` adds."""
         pairs = [
             filt.update(one, measurement, valid) for filt, one in zip(self.filters, unstack(state.states), strict=True)
         ]
@@ -138,6 +151,20 @@ class InteractingMultipleModel(Filter):
         log_probabilities = jnp.where(ok, joint - likelihood, state.log_probabilities)
         after = InteractingState(states, log_probabilities, state.step)
         return after, InteractingInfo(jnp.where(ok, likelihood, 0.0), ok, after.probabilities, infos)
+
+
+def _moved(
+    filt: InteractingMultipleModel, state: InteractingState, control: Any
+) -> tuple[Bool[Array, ""], InteractingState]:
+    moved = filt.move(state, control)
+    return tree.all_finite(moved), moved
+
+
+def _updated(
+    filt: InteractingMultipleModel, state: InteractingState, measurement: Any, valid: Bool[Array, "*m"]
+) -> tuple[Bool[Array, ""], tuple[InteractingState, InteractingInfo]]:
+    after, info = filt.correct_by(state, measurement, valid)
+    return info.ok & tree.all_finite((after, info)), (after, info)
 
 
 @eqx.filter_jit
@@ -179,7 +206,7 @@ def smooth_interacting(
     mask = jnp.ones(states.step.shape[:1], bool) if active is None else active
     last = jax.tree.map(lambda leaf: leaf[-1], states)
     before = jax.tree.map(lambda leaf: leaf[:-1], states)
-    after = jax.tree.map(lambda leaf: leaf[1:], (tree.finite_or_zero(controls), mask))
+    after = jax.tree.map(lambda leaf: leaf[1:], (validity.finite_or_neutral(controls), mask))
 
     def back(smoothed, inputs):
         state, (control, here) = inputs

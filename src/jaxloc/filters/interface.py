@@ -83,6 +83,19 @@ class GaussianInfo(Info):
     accepted: Bool[Array, ""]
 
 
+def conclude(ok: Bool[Array, ""], after: Any, info: Any, before: Any) -> tuple[Any, Any]:
+    """The result of an update where it is usable; else the state before it, and an info with finite numbers.
+
+    Args:
+        ok: whether the update is usable.
+        after: the state after it.
+        info: its `Info`.
+        before: the state before it.
+    """
+    info = eqx.tree_at(lambda i: i.ok, info, info.ok & ok)
+    return tree.where(ok, after, before), tree.where(ok, info, tree.finite_or_zero(info))
+
+
 class Filter(eqx.Module):
     """A recursive estimator: a pytree of its models, with pure functions `init`, `predict` and `update`."""
 

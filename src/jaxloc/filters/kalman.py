@@ -18,10 +18,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc import _tree as tree
-from jaxloc.beliefs import Gaussian, Motion, Sensor, chi2_quantile
+from jaxloc.beliefs import Gaussian, Motion, Sensor, chi2_quantile, validity
 from jaxloc.beliefs.models import innovation, mask_covariance
 from jaxloc.beliefs.square_root import cholesky, downdate, product, triangularize, whiten
-from jaxloc.filters.interface import Filter, GaussianInfo, GaussianState
+from jaxloc.filters.interface import Filter, GaussianInfo, GaussianState, conclude
 from jaxloc.poses import carry, is_flat, retract
 
 
@@ -123,27 +123,52 @@ class GaussianFilter(Filter):
         """The innovation of a measurement, with the joint covariance of its prediction and the state."""
 
     def init(self, prior: Gaussian) -> GaussianState:
-        """The state of a prior density."""
-        return GaussianState(prior.mean, cholesky(prior.covariance), jnp.zeros((), jnp.int32))
+        """The state of a prior density.
+
+        Where the prior is no density (non-finite numbers, an indefinite covariance), the state is that of
+        `beliefs.validity.unknown`, whose updates are not ``ok``.
+        """
+        mean, covariance = validity.usable_or_unknown(prior.mean, prior.covariance)
+        return GaussianState(mean, cholesky(covariance), jnp.zeros((), jnp.int32))
 
     def predict(self, state: GaussianState, control: Any, *, key: Key[Array, ""] | None = None) -> GaussianState:
-        """The state one step ahead; non-finite entries of the control count as zero."""
+        """The state one step ahead; non-finite entries of the control count as zero, or as no motion.
+
+        A prediction beyond the range of numbers leaves the state unchanged, but for its step.
+        """
         del key
-        joint = self.predict_joint(state, tree.finite_or_zero(control))
-        moved = GaussianState(joint.mean, joint.output_root(), state.step + 1)
-        return tree.where(
-            tree.all_finite(moved), moved, GaussianState(state.mean, state.covariance_sqrt, state.step + 1)
-        )
+        ok, moved = tree.protect(_moved, self, state, validity.finite_or_neutral(control))
+        return tree.where(ok, moved, GaussianState(state.mean, state.covariance_sqrt, state.step + 1))
 
     def update(
         self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[GaussianState, GaussianInfo]:
         """The state updated by a measurement."""
         del key
+        ok, (after, info) = tree.protect(_updated, self, state, measurement, valid)
+        return conclude(ok, after, info, state)
+
+    def correct_by(
+        self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]
+    ) -> tuple[GaussianState, GaussianInfo]:
+        """`update` without protection from non-finite numbers, which `update` adds; for filters that override it."""
         found = self.innovation(state, measurement, valid)
         root = found.joint.root()
         info = innovation_info(root, found, self.gate)
         return correct(state, root, info), info
+
+
+def _moved(filt: GaussianFilter, state: GaussianState, control: Any) -> tuple[Bool[Array, ""], GaussianState]:
+    joint = filt.predict_joint(state, control)
+    moved = GaussianState(joint.mean, joint.output_root(), state.step + 1)
+    return tree.within_range(moved), moved
+
+
+def _updated(
+    filt: GaussianFilter, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]
+) -> tuple[Bool[Array, ""], tuple[GaussianState, GaussianInfo]]:
+    after, info = filt.correct_by(state, measurement, valid)
+    return info.ok & tree.within_range(state), (after, info)
 
 
 class KalmanFilter(GaussianFilter):
@@ -186,10 +211,15 @@ class KalmanFilter(GaussianFilter):
 def linearized_motion(motion: Motion, state: GaussianState, control: Any) -> JointCovariance:
     """Joint covariance of the next state and the state, by the derivative of the motion."""
     mean, jacobian = motion.linearize(state.mean, control)
-    noise = cholesky(motion.covariance(state.mean, control))
+    noise = process_root(motion.covariance(state.mean, control))
     carried = product(jacobian, state.covariance_sqrt)
     before = jnp.concatenate([state.covariance_sqrt, jnp.zeros_like(noise)], axis=1)
     return JointCovariance(mean, jnp.concatenate([carried, noise], axis=1), before)
+
+
+def process_root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """Root of the covariance of a motion's noise; NaN where that is not finite, so that the prediction is not used."""
+    return jnp.where(tree.all_finite(covariance), cholesky(covariance), jnp.nan)
 
 
 def linearized_innovation(
@@ -217,9 +247,17 @@ def measurement_joint(
 def noise_root(
     covariance: Float[Array, "m m"], mask: Bool[Array, " m"]
 ) -> tuple[Float[Array, "m m"], Bool[Array, " m"]]:
-    """Root of a measurement covariance, unit where masked; directions without a finite variance are masked."""
-    mask = mask & jnp.isfinite(jnp.diagonal(covariance))
-    return cholesky(mask_covariance(covariance, mask)), mask
+    """Root of a measurement covariance, unit where masked.
+
+    Directions without a finite variance are masked; all are where the covariance of the others is indefinite.
+    """
+    known = jnp.sqrt(jnp.abs(lax.stop_gradient(covariance)))
+    mask = mask & (jnp.diagonal(known) < tree.largest(known.dtype))
+    finite = jnp.where(jnp.isfinite(covariance), covariance, 0.0)
+    masked = mask_covariance(finite, mask)
+    root = cholesky(masked)
+    sound = validity.factors(root, masked)
+    return jnp.where(sound, root, jnp.eye(mask.shape[0], dtype=root.dtype)), mask & sound
 
 
 def innovation_info(root: Float[Array, "n n"], found: Innovation, gate: float | None = None) -> GaussianInfo:

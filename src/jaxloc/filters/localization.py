@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
-from jaxloc.beliefs import Gaussian, KLDSize, Motion, Particles, Sensor
+from jaxloc.beliefs import Gaussian, KLDSize, Motion, Particles, Sensor, validity
 from jaxloc.beliefs.particles import finite_log_weights
 from jaxloc.beliefs.resampling.indices import systematic
 from jaxloc.beliefs.resampling.strategies import Resampling, Systematic
@@ -172,7 +172,7 @@ class MonteCarloLocalization(Filter):
                 "init_globally(n, key=key), or sample particles."
             )
         dtype, zero = prior.log_weights.dtype, jnp.zeros((), jnp.int32)
-        return LocalizationState(prior.normalize(), jnp.zeros(2, dtype), jnp.zeros((), dtype), zero, zero)
+        return LocalizationState(prior.usable().normalize(), jnp.zeros(2, dtype), jnp.zeros((), dtype), zero, zero)
 
     @eqx.filter_jit
     def init_globally(self, num_particles: int, *, key: Key[Array, ""]) -> LocalizationState:
@@ -195,22 +195,33 @@ class MonteCarloLocalization(Filter):
     def predict(
         self, state: LocalizationState, control: Any, *, key: Key[Array, ""] | None = None
     ) -> LocalizationState:
-        """The particles after a step of odometry, resampled and with random poses injected as needed."""
+        """The particles after a step of odometry, resampled and with random poses injected as needed.
+
+        An increment that is not finite counts as no motion; a particle whose motion is not finite stays where it is.
+        """
         if key is None:
             raise ValueError(
                 "Monte Carlo localization is random: predict and run need a key such as jax.random.key(0)."
             )
+        _, moved = tree.protect(MonteCarloLocalization._moved, self, state, validity.finite_or_neutral(control), key)
+        return moved
+
+    def _moved(self, state: LocalizationState, control: Any, key: Array) -> tuple[Bool[Array, ""], LocalizationState]:
         key_resample, key_move, key_inject = jax.random.split(key, 3)
         particles = self._resample(state, key_resample)
         shape = (particles.size, self.motion.noise_dimension(state.particles.best()))
         normal = jax.random.normal(key_move, shape, particles.log_weights.dtype)
         values = jax.vmap(lambda pose, n: self.motion.perturb(pose, control, n))(particles.values, normal)
+        good = tree.slots_within_range(values)
+        values = jax.vmap(tree.where)(good, values, particles.values)
+        ok = jnp.all(good | ~particles.valid)
         particles = Particles(values, particles.log_weights, particles.valid)
         # Sampling random poses is expensive, and not needed when tracking.
         particles = lax.cond(
             state.inject > 0, lambda: self._inject(particles, state.inject, key_inject), lambda: particles
         )
-        return LocalizationState(particles, state.fit, jnp.zeros_like(state.inject), state.seen, state.step + 1)
+        after = LocalizationState(particles, state.fit, jnp.zeros_like(state.inject), state.seen, state.step + 1)
+        return ok, after
 
     @eqx.filter_jit
     def update(
@@ -222,6 +233,12 @@ class MonteCarloLocalization(Filter):
         prediction replaces half of them by random poses.
         """
         del key
+        _, (after, info) = tree.protect(MonteCarloLocalization._updated, self, state, measurement, valid)
+        return after, tree.where(info.ok, info, tree.finite_or_zero(info))
+
+    def _updated(
+        self, state: LocalizationState, measurement: Any, valid: Bool[Array, "*m"]
+    ) -> tuple[Bool[Array, ""], tuple[LocalizationState, LocalizationInfo]]:
         before = state.particles
         there = jnp.any(valid)
         logs = jax.vmap(lambda pose: self.sensor.log_prob(pose, measurement, valid))(before.values)
@@ -239,7 +256,8 @@ class MonteCarloLocalization(Filter):
             state.seen + ok.astype(jnp.int32),
             state.step,
         )
-        return after, self._describe(after, jnp.where(ok, full.log_total, 0.0), ok | ~there, exponent)
+        ok, likelihood = (ok | ~there) & jnp.any(before.valid), jnp.where(ok, full.log_total, 0.0)
+        return ok, (after, self._describe(after, likelihood, ok, exponent))
 
     def _describe(self, after: LocalizationState, likelihood: Array, ok: Array, exponent: Array) -> LocalizationInfo:
         return LocalizationInfo(likelihood, ok, after.particles.ess, exponent, after.inject, after.estimate())

@@ -11,7 +11,7 @@ from jax.sharding import AxisType
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
-from jaxloc.beliefs import Motion, Particles, Sensor
+from jaxloc.beliefs import Motion, Particles, Sensor, validity
 from jaxloc.beliefs.kld_sampling import KLDSize
 from jaxloc.beliefs.particles import NOTHING
 from jaxloc.beliefs.resampling.strategies import Resampling, Systematic
@@ -124,25 +124,33 @@ class ParticleFilter(Filter):
             )
         _refuse_explicit(prior.log_weights)
         indices = jnp.arange(prior.size, dtype=jnp.int32)
-        noise, zero = self.proposal.init_noise(prior.values), jnp.zeros((), jnp.int32)
-        return ParticleState(prior.normalize(), indices, jnp.zeros((), bool), noise, zero)
+        noise, zero = self.proposal.init_noise(prior.usable().values), jnp.zeros((), jnp.int32)
+        return ParticleState(prior.usable().normalize(), indices, jnp.zeros((), bool), noise, zero)
 
     @eqx.filter_jit
     def predict(self, state: ParticleState, control: Any, *, key: Key[Array, ""] | None = None) -> ParticleState:
-        """The particles one step ahead, resampled if needed."""
+        """The particles one step ahead, resampled if needed.
+
+        Non-finite entries of the control count as zero, or as no motion. A particle whose motion is not finite or
+        overflows stays where it is.
+        """
         if key is None:
             raise ValueError("A particle filter is random: predict and run need a key, such as jax.random.key(0).")
+        return tree.protect(ParticleFilter._moved, self, state, validity.finite_or_neutral(control), key)[1]
+
+    def _moved(self, state: ParticleState, control: Any, key: Array) -> tuple[Bool[Array, ""], ParticleState]:
         key_resample, key_move = jax.random.split(key)
         if self.proposal.resamples_with_measurement:
             choice = _unchanged(state.particles)
         else:
             choice = self.resample(state.particles, key=key_resample)
         drawn = self.proposal.draw(self.motion, choice.particles.values, control, key=key_move)
+        ok, drawn = drawn.where_finite(choice.particles, self.proposal.init_noise(choice.particles.values))
         values, log_weights = drawn.values, choice.particles.log_weights
         if not self._pathwise:
             values, log_weights = lax.stop_gradient(values), log_weights + score(drawn.log_density)
         particles = Particles(values, log_weights, choice.particles.valid)
-        return ParticleState(particles, choice.ancestors, choice.resampled, drawn.noise, state.step + 1)
+        return ok, ParticleState(particles, choice.ancestors, choice.resampled, drawn.noise, state.step + 1)
 
     @eqx.filter_jit
     def update(
@@ -151,26 +159,32 @@ class ParticleFilter(Filter):
         """The particles weighted by a measurement; only `Auxiliary` needs a key."""
         if key is None and self.proposal.resamples_with_measurement:
             raise ValueError("Auxiliary resamples in its update, which needs a key.")
+        _, (after, info) = tree.protect(ParticleFilter._updated, self, state, measurement, valid, key)
+        return after, tree.where(info.ok, info, tree.finite_or_zero(info))
+
+    def _updated(
+        self, state: ParticleState, measurement: Any, valid: Bool[Array, "*m"], key: Array | None
+    ) -> tuple[Bool[Array, ""], tuple[ParticleState, ParticleInfo]]:
         observation = Observation(self.sensor, measurement, valid, self._pathwise)
         weighted = self.proposal.weigh(
             state.particles, state.noise, observation, lambda particles: self.resample(particles, key=key)
         )
-        ok = weighted.particles.ok
+        ok = weighted.particles.ok & tree.all_finite(weighted)
         particles = lax.cond(ok, lambda: weighted.particles.normalize(), lambda: self.inflate(state.particles))
         choice = weighted.choice or Resampled(state.particles, state.ancestors, state.resampled)
         after = ParticleState(particles, choice.ancestors, choice.resampled, weighted.noise, state.step)
         measured = jnp.any(valid)
-        after = tree.where(measured, after, state)
+        after = tree.where(measured & tree.all_finite(after), after, state)
         floor = math.log(float(jnp.finfo(particles.log_weights.dtype).tiny))
         likelihood = jnp.where(ok, weighted.particles.log_total, floor)
         info = ParticleInfo(
             log_likelihood=jnp.where(measured, likelihood, 0.0),
-            ok=ok | ~measured,
+            ok=(ok | ~measured) & jnp.any(state.particles.valid),
             ess=after.particles.ess,
             resampled=after.resampled,
             count=after.particles.count,
         )
-        return after, info
+        return info.ok, (after, info)
 
     def resample(self, particles: Particles, *, key: Key[Array, ""]) -> Resampled:
         """Resamples where the effective sample size is below the threshold."""

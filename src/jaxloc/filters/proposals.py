@@ -76,6 +76,25 @@ class Sampled(eqx.Module):
     noise: MotionNoise | None
     log_density: Float[Array, " n"]
 
+    def where_finite(self, particles: Particles, noise: MotionNoise | None) -> tuple[Bool[Array, ""], "Sampled"]:
+        """Moved particles, and those that did not move where the motion is not finite or overflows.
+
+        Args:
+            particles: before the motion.
+            noise: placeholder of the noise of those that did not move.
+
+        Returns:
+            Whether all valid particles moved, and the particles.
+        """
+        drawn = None if self.noise is None else (self.noise.centers, self.noise.roots, self.noise.normals)
+        good = tree.slots_within_range((self.values, drawn))
+        choose = jax.vmap(tree.where)
+        density = jnp.where(good & jnp.isfinite(self.log_density), self.log_density, 0.0)
+        if self.noise is not None and noise is not None:
+            noise = MotionNoise(*choose(good, drawn, (noise.centers, noise.roots, noise.normals)), self.noise.fresh)
+        moved = Sampled(choose(good, self.values, particles.values), noise, density)
+        return jnp.all(good | ~particles.valid), moved
+
 
 class Proposal(eqx.Module):
     """How particles are sampled and weighted.
@@ -121,9 +140,9 @@ class Observation(eqx.Module):
     pathwise: bool = eqx.field(static=True)
 
     def log_likelihood(self, values: Any) -> Float[Array, " n"]:
-        """Log likelihood at each particle; `NOTHING` where it is NaN or minus infinity."""
+        """Log likelihood at each particle; `NOTHING` where it is NaN, or beyond the range of numbers."""
         found = jax.vmap(lambda value: self.sensor.log_prob(value, self.measurement, self.valid))(values)
-        good = (found > NOTHING) & (found < jnp.inf)
+        good = (found > max(NOTHING, -tree.largest(found.dtype))) & (found < jnp.inf)
         return jnp.where(good, jnp.where(good, found, 0.0), NOTHING)
 
 

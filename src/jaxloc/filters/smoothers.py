@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
 from jaxloc._linalg import back_substitution
+from jaxloc.beliefs import validity
 from jaxloc.beliefs.square_root import product, triangularize
 from jaxloc.filters.interface import GaussianState, History
 from jaxloc.filters.kalman import GaussianFilter, retract_root
@@ -140,7 +141,7 @@ def smooth_fixed_lag(
 
 def reverse_step(filt: GaussianFilter, state: GaussianState, control: Any) -> ReverseStep:
     """Backward conditional of a state, from the filter's joint covariance of its prediction."""
-    joint = filt.predict_joint(state, tree.finite_or_zero(control))
+    joint = filt.predict_joint(state, validity.finite_or_neutral(control))
     return ReverseStep(joint.mean, *regression(joint.root()))
 
 

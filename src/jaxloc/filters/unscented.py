@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc.beliefs import Motion, Sensor
 from jaxloc.beliefs.models import innovation
-from jaxloc.beliefs.square_root import cholesky, product
+from jaxloc.beliefs.square_root import product
 from jaxloc.filters.interface import GaussianState
-from jaxloc.filters.kalman import GaussianFilter, Innovation, JointCovariance, noise_root
+from jaxloc.filters.kalman import GaussianFilter, Innovation, JointCovariance, noise_root, process_root
 from jaxloc.poses import is_flat, local, retract
 
 _MEAN_STEPS = 3  # of the intrinsic mean on a manifold; the error is squared each time
@@ -160,7 +160,7 @@ class SigmaPointFilter(GaussianFilter):
 
     def predict_joint(self, state: GaussianState, control: Any) -> JointCovariance:
         """By the motion evaluated at the points."""
-        noise = cholesky(self.motion.covariance(state.mean, control))
+        noise = process_root(self.motion.covariance(state.mean, control))
         return self._joint(lambda x: self.motion.move(x, control), state, noise, None)
 
     def innovation(self, state: GaussianState, measurement: Any, valid: Bool[Array, "*m"]) -> Innovation:

@@ -189,9 +189,10 @@ def confusion(
 
 
 def sanitize(reading: RangeBearing, valid: Bool[Array, ""]) -> tuple[RangeBearing, Bool[Array, ""]]:
-    """A reading with non-finite values replaced, and whether it was valid and finite."""
+    """A reading with non-finite values replaced, and whether it was valid, finite and within range."""
     values = jnp.stack([reading.range, reading.bearing.cos, reading.bearing.sin])
-    usable = valid & jnp.all(jnp.isfinite(values)) & (reading.range > 0.0)
+    unit = jnp.abs(reading.bearing.cos**2 + reading.bearing.sin**2 - 1.0) < 0.1
+    usable = valid & tree.within_range(values) & (reading.range > 0.0) & unit
     stand_in = jnp.ones_like(reading.range), SO2.identity(reading.range.dtype)
     safe = tree.where(usable, (reading.range, reading.bearing), stand_in)
     return RangeBearing(*safe, reading.landmark), usable

@@ -21,10 +21,11 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
-from jaxloc.beliefs import Gaussian, Motion, gate
+from jaxloc.beliefs import Gaussian, Motion, gate, validity
 from jaxloc.beliefs.models import innovation, mask_covariance
 from jaxloc.beliefs.square_root import cholesky, solve, whiten
 from jaxloc.filters import Filter, FilterState, Info
+from jaxloc.filters.interface import conclude
 from jaxloc.poses import SE2
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.landmarks import RangeBearing, locate, locate_covariance, observe, polar_jacobian, sanitize
@@ -136,11 +137,12 @@ class EkfSlam(Filter):
         self.capacity, self.probability, self.probability_new = capacity, probability, probability_new
 
     def init(self, prior: Gaussian) -> SlamState:
-        """The state before any reading, from a density of the pose."""
-        size, dtype, pose = 3 + 2 * self.capacity, prior.covariance.dtype, prior.mean
+        """The state before any reading, from a density of the pose; updates are not ``ok`` where it is none."""
+        pose, own = validity.usable_or_unknown(prior.mean, prior.covariance)
+        size, dtype = 3 + 2 * self.capacity, own.dtype
         turn = jnp.eye(3, dtype=dtype).at[:2, :2].set(pose.rotation.matrix())
         turn = turn.at[:2, 2].set(-_quarter_turn(pose.translation))
-        block = matmul(matmul(turn, prior.covariance), turn.T)
+        block = matmul(matmul(turn, own), turn.T)
         covariance = jnp.zeros((size, size), dtype).at[:3, :3].set(block)
         none = jnp.zeros(self.capacity, bool)
         landmarks = jnp.zeros((self.capacity, 2), dtype)
@@ -148,8 +150,15 @@ class EkfSlam(Filter):
 
     @eqx.filter_jit
     def predict(self, state: SlamState, control: Any, *, key: Key[Array, ""] | None = None) -> SlamState:
-        """Predicts the pose; landmarks stay where they are."""
+        """Predicts the pose; landmarks stay where they are.
+
+        An increment that is not finite counts as no motion; one that overflows leaves the state unchanged.
+        """
         del key
+        ok, moved = tree.protect(EkfSlam._moved, self, state, validity.finite_or_neutral(control))
+        return _choose(ok, moved, eqx.tree_at(lambda s: s.step, state, state.step + 1))
+
+    def _moved(self, state: SlamState, control: Any) -> tuple[Bool[Array, ""], SlamState]:
         pose = self.motion.move(state.pose, control)
         noise = self.motion.covariance(state.pose, control)
         points = jnp.where(state.seen[:, None], state.landmarks, 0.0)
@@ -159,7 +168,8 @@ class EkfSlam(Filter):
         rest = jnp.concatenate([jnp.zeros((turned.shape[0], 2), moved.dtype), turned], axis=1)
         lever = jnp.concatenate([moved, heading, rest])
         covariance = state.covariance + matmul(matmul(lever, noise), lever.T)
-        return SlamState(pose, state.landmarks, covariance, state.seen, state.support, state.step + 1)
+        moved = SlamState(pose, state.landmarks, covariance, state.seen, state.support, state.step + 1)
+        return _is_usable(moved), moved
 
     @eqx.filter_jit
     def update(
@@ -167,6 +177,12 @@ class EkfSlam(Filter):
     ) -> tuple[SlamState, SlamInfo]:
         """Updates pose and landmark by one reading, or adds the landmark to the map."""
         del key
+        ok, (after, info) = tree.protect(EkfSlam._updated, self, state, measurement, valid)
+        return conclude(ok, after, info, state)
+
+    def _updated(
+        self, state: SlamState, measurement: RangeBearing, valid: Bool[Array, ""]
+    ) -> tuple[Bool[Array, ""], tuple[SlamState, SlamInfo]]:
         reading, usable = sanitize(measurement, valid & (measurement.landmark < self.capacity))
         index, nis, fresh = self._associate(state, reading)
         near = gate(nis, 2, self.probability) & ~fresh
@@ -179,8 +195,8 @@ class EkfSlam(Filter):
         support = state.support.at[index].add(jnp.where(usable & (known | adds), change, 0), mode="drop")
         after = eqx.tree_at(lambda s: s.support, after, support)
         info = _inform(corrected[1], corrected[2], known, near, index, adds)
-        fine = _is_finite(after)
-        return _choose(fine, after, state), eqx.tree_at(lambda i: i.ok, info, fine)
+        fine = _is_usable(state) & _is_usable(after) & tree.within_range(info.innovation_covariance)
+        return fine, (after, eqx.tree_at(lambda i: i.ok, info, fine))
 
     def _linearize(self, state: SlamState, reading: RangeBearing, index: Any) -> tuple[Array, Array]:
         """Residual of a reading of one row, and its Jacobian by that landmark less the position (world axes)."""
@@ -281,6 +297,5 @@ def _choose(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
     return tree.where(condition, yes, no)
 
 
-def _is_finite(state: SlamState) -> Bool[Array, ""]:
-    values = (state.pose.translation, state.pose.rotation.cos, state.landmarks, state.covariance)
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(value)) for value in values]))
+def _is_usable(state: SlamState) -> Bool[Array, ""]:
+    return tree.within_range((state.pose, state.landmarks, state.covariance))

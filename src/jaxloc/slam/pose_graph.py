@@ -5,10 +5,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _linalg
+from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
+from jaxloc.beliefs import validity
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Problem, Quadratic, solve
 from jaxloc.solvers.gauss_newton import Solver
 
@@ -74,16 +77,19 @@ class PoseGraph(Problem):
 
     @staticmethod
     def of(edges: Edges, poses: Any, loss: Any) -> "PoseGraph":
-        """Problem from edges and an initial value; empty and out-of-range edges are masked."""
+        """Problem from edges and an initial value.
+
+        Edges are masked that are empty, lead to poses that do not exist, or whose measurement is no pose or covariance.
+        """
         count, dof = poses.batch_shape[0], edges.covariance.shape[-1]
         good = edges.valid & (edges.first >= 0) & (edges.second >= 0)
         good = good & (edges.first < count) & (edges.second < count) & (edges.first != edges.second)
         eye = jnp.eye(dof, dtype=edges.covariance.dtype)
-        known, definite = jax.vmap(lambda matrix: _linalg.first_cholesky(matrix[None]))(
-            jnp.where(good[:, None, None], edges.covariance, eye[None])
-        )
-        good = good & definite
-        lower = jnp.where(good[:, None, None], known, eye[None])
+        good = good & jax.vmap(_is_pose)(edges.T_first_second)
+        good = good & jax.vmap(_is_definite)(jnp.where(good[:, None, None], edges.covariance, eye[None]))
+        # Safe matrices in: a factorization that fails has no derivatives.
+        known = jnp.where(good[:, None, None], edges.covariance, eye[None])
+        lower, _ = jax.vmap(lambda matrix: _linalg.first_cholesky(matrix[None]))(known)
         whitener = jax.vmap(lambda matrix: _linalg.forward_substitution(matrix, eye))(lower)
         neutral = type(poses).identity(eye.dtype)
         measured = jax.vmap(lambda use, pose: _where(use, pose, neutral))(good, edges.T_first_second)
@@ -138,8 +144,8 @@ def optimize(
 
     Returns:
         Estimate of all poses, the first with zero covariance. Its covariance is that of the stacked tangents, pose by
-        pose ("n d" x "n d"). Not ok where edges do not tie every pose to the first one. Derivatives by measurements and
-        the first pose are those of the solution.
+        pose ("n d" x "n d"). Not ok where edges do not tie every pose to the first one, or an initial pose is none.
+        Derivatives by measurements and the first pose are those of the solution.
 
     Raises:
         ValueError: there are fewer than two poses, or covariances of another size than the poses' tangents.
@@ -169,12 +175,16 @@ def optimize(
         raise ValueError(
             f"optimize: covariances of size {edges.covariance.shape[-1]} came with poses of {poses.dof} directions."
         )
+    given = jax.vmap(_is_pose)(poses)
+    poses = jax.vmap(tree.where)(given, poses, validity.neutral(poses))
     problem = PoseGraph.of(edges, poses, loss)
     fit = solve(problem, _at(poses, slice(1, None)), solver=solver, max_steps=max_steps)
     value = jax.tree.map(lambda head, rest: jnp.concatenate([head[None], rest]), problem.fixed, fit.value)
     pad = ((poses.dof, 0), (poses.dof, 0))
     covariance, information = jnp.pad(fit.covariance, pad), jnp.pad(fit.information, pad)
-    return Estimate(value, covariance, fit.cost, fit.ok, fit.num_steps, fit.status, information)
+    ok = fit.ok & jnp.all(given)
+    value = tree.detach_unless(ok, value)
+    return Estimate(value, covariance, fit.cost, ok, fit.num_steps, fit.status, information)
 
 
 def marginals(fit: Estimate) -> Float[Array, "n d d"]:
@@ -199,6 +209,20 @@ def marginals(fit: Estimate) -> Float[Array, "n d d"]:
     blocks = fit.covariance.reshape(count, dof, count, dof)
     each = jnp.arange(count)
     return blocks[each, :, each, :]
+
+
+def _is_pose(pose: Any) -> Bool[Array, ""]:
+    """Whether a pose is finite, within range, and its rotation is one."""
+    pose = lax.stop_gradient(pose)
+    rotation = getattr(pose, "rotation", pose)
+    turned = rotation.compose(rotation.inverse()).matrix()
+    return tree.within_range(pose) & jnp.all(jnp.abs(turned - jnp.eye(turned.shape[0], dtype=turned.dtype)) < 0.1)
+
+
+def _is_definite(covariance: Float[Array, "d d"]) -> Bool[Array, ""]:
+    """Whether a covariance has an inverse root within the range of numbers; without derivatives."""
+    lower, definite = _linalg.first_cholesky(lax.stop_gradient(covariance)[None])
+    return definite & tree.within_range((lower, 1.0 / jnp.diagonal(lower)))
 
 
 def _at(poses: Any, index: Any) -> Any:

@@ -19,8 +19,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxloc import _tree as tree
 from jaxloc.beliefs import Mixture
 from jaxloc.filters import FilterState
+from jaxloc.filters.interface import conclude
 from jaxloc.tracking import intensity
-from jaxloc.tracking.gating import at_least_one, compare, usable_measurements
+from jaxloc.tracking.gating import at_least_one, compare, safe_measurements, usable_measurements
 from jaxloc.tracking.gmphd import GmPhd
 from jaxloc.tracking.intensity import Evidence, safe_log
 from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
@@ -82,26 +83,37 @@ class GmCphd(Tracker):
         phd, first = self.phd, state.num_labels
         mixture = intensity.predict(state.mixture, phd.model, control, first_label=first, spawning=phd.spawning)
         born = mixture.weights[state.mixture.capacity :]
-        survivors = survive(state.cardinality, self.phd.model.survival)
-        births = _poisson(jnp.sum(born), self.max_targets)
-        sums = jnp.convolve(survivors, births, precision="highest")[: self.max_targets + 1]
-        sums = sums / jnp.sum(sums)
+        _, sums = tree.protect(_predicted_number, state.cardinality, phd.model.survival_probability(), jnp.sum(born))
         return CphdState(mixture, sums, state.step + 1, first + born.shape[0])
 
     def update(
         self, state: CphdState, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[CphdState, TrackerInfo]:
-        """The intensity and the cardinality given a scan."""
+        """The intensity and the cardinality given a scan; the predicted ones where the scan cannot be used."""
         del key
         measurement, valid = at_least_one(measurement, valid)
+        ok, (after, info) = tree.protect(GmCphd._updated, self, state, measurement, valid)
+        held = CphdState(
+            intensity.predicted_only(state.mixture, self.phd.capacity), state.cardinality, state.step, after.num_labels
+        )
+        return conclude(ok, after, info, held)
+
+    def _updated(
+        self, state: CphdState, measurement: Any, valid: Bool[Array, " m"]
+    ) -> tuple[Bool[Array, ""], tuple[CphdState, TrackerInfo]]:
         evidence, cardinality = self._weigh(state, measurement, valid)
         first = state.num_labels
         reduced, crowded = self.phd.reduced(state.mixture, measurement, evidence, first)
         reduced = intensity.make_labels_unique(reduced, _most_probable(reduced, cardinality), first)
-        ok = jnp.isfinite(evidence.log_likelihood)
+        after = CphdState(reduced, cardinality, state.step, first + self.phd.capacity)
+        ok = (
+            tree.all_finite((after, evidence.log_likelihood))
+            & self.phd.model.usable
+            & jnp.any(evidence.comparison.usable)
+        )
         count = jnp.sum(cardinality * jnp.arange(cardinality.shape[0], dtype=cardinality.dtype))
         info = TrackerInfo(jnp.where(ok, evidence.log_likelihood, 0.0), ok, count, crowded)
-        return CphdState(reduced, cardinality, state.step, first + self.phd.capacity), info
+        return ok, (after, info)
 
     def extract(self, state: CphdState) -> Targets:
         """The heaviest components, as many as the most probable number of targets."""
@@ -114,12 +126,16 @@ class GmCphd(Tracker):
     ) -> tuple[Evidence, Float[Array, " n"]]:
         model, mixture = self.phd.model, state.mixture
         valid = usable_measurements(measurements, valid)
-        measurements = tree.finite_or_zero(measurements)
+        measurements = safe_measurements(measurements, valid)
         comparison = compare(model.filter, mixture.means, mixture.roots(), measurements, valid, self.phd.gate)
-        expected = jax.vmap(model.detection.probability)(mixture.means) * mixture.weights
+        detection, known = model.detect(mixture.means)
+        comparison = eqx.tree_at(lambda c: c.usable, comparison, comparison.usable & known)
+        expected = detection * mixture.weights
         pairs = safe_log(expected)[:, None] + comparison.log_likelihood
         density = jax.vmap(model.clutter.log_density)(measurements)
-        sums = logsumexp(pairs, axis=0)
+        # The derivative of a sum over nothing is NaN.
+        some = jnp.any(jnp.isfinite(pairs), axis=0)
+        sums = jnp.where(some, logsumexp(jnp.where(some[None, :], pairs, 0.0), axis=0), -jnp.inf)
         seen = jnp.isfinite(sums) & valid
         ratios = jnp.where(seen, sums - density, _NEVER)
         log_rate, count = safe_log(model.clutter.rate), jnp.sum(valid)
@@ -182,6 +198,17 @@ def symmetric_functions(logs: Float[Array, " m"], order: int) -> Float[Array, " 
         return jnp.logaddexp(sums, jnp.maximum(shifted, _NEVER)), None
 
     return lax.scan(multiply, none, jnp.maximum(logs, _NEVER))[0]
+
+
+def _predicted_number(
+    cardinality: Float[Array, " n"], survival: Float[Array, ""], born: Float[Array, ""]
+) -> tuple[Bool[Array, ""], Float[Array, " n"]]:
+    """Distribution of the number of survivors and newborn targets; unchanged where it is not finite."""
+    largest = cardinality.shape[0] - 1
+    sums = jnp.convolve(survive(cardinality, survival), _poisson(born, largest), precision="highest")[: largest + 1]
+    sums = sums / jnp.sum(sums)
+    ok = tree.all_finite(sums)
+    return ok, jnp.where(ok, sums, cardinality)
 
 
 def _most_probable(mixture: Mixture, cardinality: Float[Array, " n"]) -> Bool[Array, " k"]:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
-from jaxloc.beliefs import chi2_quantile
+from jaxloc.beliefs import chi2_quantile, validity
 from jaxloc.beliefs.models import innovation
 from jaxloc.beliefs.square_root import product, whiten
 from jaxloc.filters import GaussianState
@@ -26,6 +26,7 @@ class Comparison(eqx.Module):
         inside: whether a pair passes the gate.
         residuals: whitened innovations ``S^-1/2 (z - h(x))``.
         roots: root of the covariance of (measurement, state) of each target.
+        usable: which targets the sensor can measure: with a finite prediction and a covariance of its noise.
     """
 
     log_likelihood: Float[Array, "k m"]
@@ -33,6 +34,7 @@ class Comparison(eqx.Module):
     inside: Bool[Array, "k m"]
     residuals: Float[Array, "k m z"]
     roots: Float[Array, "k n n"]
+    usable: Bool[Array, " k"]
 
     def innovation_covariances(self) -> Float[Array, "k z z"]:
         """S of each target."""
@@ -53,11 +55,13 @@ def at_least_one(measurements: Any, valid: Bool[Array, " m"]) -> tuple[Any, Bool
 
 
 def usable_measurements(measurements: Any, valid: Bool[Array, " m"]) -> Bool[Array, " m"]:
-    """Mask of the measurements that are valid and finite."""
-    leaves = [leaf for leaf in jax.tree.leaves(measurements) if eqx.is_inexact_array(leaf)]
-    for leaf in leaves:
-        valid = valid & jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim)))
-    return valid
+    """Mask of the measurements that are valid, finite and within the range of numbers."""
+    return valid & tree.slots_within_range(measurements)
+
+
+def safe_measurements(measurements: Any, usable: Bool[Array, " m"]) -> Any:
+    """The measurements with zeros and identities in place of those that are not usable."""
+    return jax.vmap(tree.where)(usable, measurements, validity.neutral(measurements))
 
 
 def compare(
@@ -82,14 +86,14 @@ def compare(
         Bar-Shalom, Li, Kirubarajan 2001, section 3.3 [T-58], [T-85].
     """
     valid = usable_measurements(measurements, valid)
-    measurements = tree.finite_or_zero(measurements)
+    measurements = safe_measurements(measurements, valid)
     template = jax.tree.map(lambda leaf: leaf[0], measurements)
 
     def expect(mean, root):
         found = filt.innovation(GaussianState(mean, root, jnp.zeros((), jnp.int32)), template, jnp.array(True))
-        return found.joint.mean, found.joint.root()
+        return found.joint.mean, found.joint.root(), jnp.all(found.mask)
 
-    expected, both = jax.vmap(expect)(means, roots)
+    expected, both, usable = jax.vmap(expect)(means, roots)
     differences = jax.vmap(lambda center: jax.vmap(lambda z, v: innovation(center, z, v)[0])(measurements, valid))(
         expected
     )
@@ -100,13 +104,14 @@ def compare(
     volume = jnp.sum(jnp.log(jnp.diagonal(measured, axis1=-2, axis2=-1)), axis=-1) + 0.5 * size * math.log(
         2.0 * math.pi
     )
-    inside = jnp.broadcast_to(valid[None, :], squared.shape)
+    usable = usable & jax.vmap(tree.all_finite)(both)
+    inside = valid[None, :] & usable[:, None] & (squared < tree.largest(squared.dtype))
     if gate is not None:
         with jax.ensure_compile_time_eval():
             bound = float(chi2_quantile(gate, float(size)))
         inside = inside & (squared <= bound)
     likelihood = jnp.where(inside, -0.5 * squared - volume[:, None], -jnp.inf)
-    return Comparison(likelihood, squared, inside, residuals, both)
+    return Comparison(likelihood, squared, inside, residuals, both, usable)
 
 
 def corrected(

@@ -10,8 +10,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
 from jaxloc.beliefs import Closeness, MahalanobisDistance, Mixture
 from jaxloc.filters import FilterState
+from jaxloc.filters.interface import conclude
 from jaxloc.tracking import intensity
 from jaxloc.tracking.gating import at_least_one
 from jaxloc.tracking.intensity import Spawning
@@ -91,7 +93,9 @@ class GmPhd(Tracker):
         if prior.capacity > self.capacity:
             raise ValueError(f"GmPhd keeps {self.capacity} components; the prior has {prior.capacity}. Reduce it.")
         one = jnp.ones((), prior.weights.dtype)
-        return PhdState(prior.check().padded(self.capacity), jnp.zeros((), jnp.int32), jnp.max(prior.labels) + 1, one)
+        return PhdState(
+            prior.check().usable().padded(self.capacity), jnp.zeros((), jnp.int32), jnp.max(prior.labels) + 1, one
+        )
 
     def predict(self, state: PhdState, control: Any, *, key: Key[Array, ""] | None = None) -> PhdState:
         """Survivors move, others appear."""
@@ -104,9 +108,21 @@ class GmPhd(Tracker):
     def update(
         self, state: PhdState, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[PhdState, TrackerInfo]:
-        """``D = (1 - p_D) D- + sum_z sum_j w_j(z) N(m_j(z), P_j)``, reduced to the capacity."""
+        """``D = (1 - p_D) D- + sum_z sum_j w_j(z) N(m_j(z), P_j)``, reduced to the capacity.
+
+        Where the scan cannot be used, the state is the predicted one, reduced to the capacity.
+        """
         del key
         measurement, valid = at_least_one(measurement, valid)
+        ok, (after, info) = tree.protect(GmPhd._updated, self, state, measurement, valid)
+        held = PhdState(
+            intensity.predicted_only(state.mixture, self.capacity), state.step, after.num_labels, state.clutter_scale
+        )
+        return conclude(ok, after, info, held)
+
+    def _updated(
+        self, state: PhdState, measurement: Any, valid: Bool[Array, " m"]
+    ) -> tuple[Bool[Array, ""], tuple[PhdState, TrackerInfo]]:
         scale = state.clutter_scale
         evidence = intensity.weigh(state.mixture, measurement, valid, self.model, gate=self.gate, clutter_scale=scale)
         reduced, crowded = self.reduced(state.mixture, measurement, evidence, state.num_labels)
@@ -116,9 +132,10 @@ class GmPhd(Tracker):
             share = 1.0 / self.clutter_memory
             seen = jnp.sum(jnp.where(evidence.valid, evidence.clutter, 0.0)) / self.model.clutter.rate
             scale = (1.0 - share) * scale + share * seen
-        ok = jnp.isfinite(evidence.log_likelihood)
+        after = PhdState(reduced, state.step, first + self.capacity, scale)
+        ok = tree.all_finite((after, evidence.log_likelihood)) & self.model.usable & jnp.any(evidence.comparison.usable)
         info = TrackerInfo(jnp.where(ok, evidence.log_likelihood, 0.0), ok, reduced.mass, crowded)
-        return PhdState(reduced, state.step, first + self.capacity, scale), info
+        return ok, (after, info)
 
     def reduced(
         self, mixture: Mixture, measurement: Any, evidence: intensity.Evidence, first_label: Any

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
 from jaxloc.solvers.assignment import assign
@@ -47,11 +47,8 @@ class GlobalNearestNeighbor(TrackTable, Tracker):
         ([3.0, 33.0], [0, 1])
     """
 
-    def update(
-        self, state: Tracks, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
-    ) -> tuple[Tracks, TrackerInfo]:
+    def associate_scan(self, state: Tracks, measurement: Any, valid: Bool[Array, " m"]) -> tuple[Tracks, TrackerInfo]:
         """The tracks given a scan; the likelihood is that of the chosen assignment."""
-        del key
         scan = compare_scan(self.model, state, measurement, valid, self.gate)
         pairs = jnp.isfinite(scan.log_odds)
         found = assign(-scan.log_odds, pairs, unassigned=-scan.log_missed)
@@ -65,8 +62,7 @@ class GlobalNearestNeighbor(TrackTable, Tracker):
         newborn = jnp.where(taken, 0.0, scan.share)
         after, crowded = manage_tracks(aged, scan.newborn.states, newborn, self.logic)
         likelihood = scan.base - found.cost
-        ok = tree.all_finite((after, likelihood))
-        after = tree.where(ok, after, state)
+        ok = tree.all_finite((after, likelihood)) & scan.usable
         info = TrackerInfo(jnp.where(ok, likelihood, 0.0), ok, jnp.sum(after.existence), crowded)
         return after, info
 

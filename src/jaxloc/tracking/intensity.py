@@ -11,11 +11,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
-from jaxloc.beliefs import Closeness, Mixture, Motion, reduce_mixture
+from jaxloc.beliefs import Closeness, Mixture, Motion, reduce_mixture, validity
 from jaxloc.filters import GaussianState
 from jaxloc.filters.kalman import linearized_motion
 from jaxloc.poses.lie_group import as_floats
-from jaxloc.tracking.gating import Comparison, compare, corrected, usable_measurements
+from jaxloc.tracking.gating import Comparison, compare, corrected, safe_measurements, usable_measurements
 from jaxloc.tracking.models.birth import Birth, MeasuredBirth
 from jaxloc.tracking.models.target import TargetModel
 
@@ -89,18 +89,31 @@ def predict(
     References:
         Vo and Ma 2006, eqs. 24-27 [T-75].
     """
-    control = tree.finite_or_zero(control)
+    predicted = tree.protect(_predicted, mixture, model, validity.finite_or_neutral(control), first_label, spawning)[1]
+    return predicted.usable()
+
+
+def _predicted(
+    mixture: Mixture, model: TargetModel, control: Any, first_label: Any, spawning: Spawning | None
+) -> tuple[Bool[Array, ""], Mixture]:
     zero = jnp.zeros((), jnp.int32)
     states = jax.vmap(lambda mean, root: GaussianState(mean, root, zero))(mixture.means, mixture.roots())
     moved = jax.vmap(lambda state: model.filter.predict(state, control))(states)
-    predicted = Mixture(model.survival * mixture.weights, moved.mean, moved.covariance, mixture.labels)
+    predicted = Mixture(model.survival_probability() * mixture.weights, moved.mean, moved.covariance, mixture.labels)
     parts = [] if spawning is None else [spawning.intensity(mixture, states, control)]
     parts.append(model.birth.mixture(jax.tree.map(lambda leaf: leaf[0], mixture.means)))
     for part in parts:
         labels = first_label + jnp.arange(part.capacity, dtype=jnp.int32)
         first_label = first_label + part.capacity
         predicted = predicted.concatenate(Mixture(part.weights, part.means, part.covariances, labels))
-    return predicted
+    return tree.all_finite(predicted), predicted
+
+
+def predicted_only(mixture: Mixture, capacity: int) -> Mixture:
+    """The heaviest components of a predicted mixture: what is left where a scan cannot be used."""
+    mixture = mixture.usable()
+    _, order = lax.top_k(lax.stop_gradient(mixture.weights), min(capacity, mixture.capacity))
+    return mixture.take(order).padded(capacity)
 
 
 def weigh(
@@ -126,9 +139,11 @@ def weigh(
         Vo and Ma 2006, eqs. 28-34 [T-75].
     """
     valid = usable_measurements(measurements, valid)
-    measurements = tree.finite_or_zero(measurements)
+    measurements = safe_measurements(measurements, valid)
     comparison = compare(model.filter, mixture.means, mixture.roots(), measurements, valid, gate)
-    expected = jax.vmap(model.detection.probability)(mixture.means) * mixture.weights
+    detection, known = model.detect(mixture.means)
+    comparison = eqx.tree_at(lambda c: c.usable, comparison, comparison.usable & known)
+    expected = detection * mixture.weights
     pairs = safe_log(expected)[:, None] + comparison.log_likelihood
     clutter = jax.vmap(model.clutter.log_intensity)(measurements) + safe_log(jnp.asarray(clutter_scale, pairs.dtype))
     born = jnp.full_like(clutter, -jnp.inf)
@@ -162,7 +177,7 @@ def heaviest(
         candidates: how many components are taken.
         first_label: label of a component born with the first measurement; those of the others follow.
     """
-    measurements = tree.finite_or_zero(measurements)
+    measurements = safe_measurements(measurements, evidence.valid)
     num, num_measured = evidence.pairs.shape
     parts = [evidence.missed, evidence.pairs.reshape(-1)]
     if isinstance(birth, MeasuredBirth):

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float
 
 from jaxloc._linalg import matmul
 from jaxloc.tracking.interface import Tracker, TrackerInfo
@@ -151,11 +151,8 @@ class JointProbabilisticDataAssociation(TrackTable, Tracker):
     def __check_init__(self):
         require_gaussian(self.model, "JointProbabilisticDataAssociation")
 
-    def update(
-        self, state: Tracks, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
-    ) -> tuple[Tracks, TrackerInfo]:
+    def associate_scan(self, state: Tracks, measurement: Any, valid: Bool[Array, " m"]) -> tuple[Tracks, TrackerInfo]:
         """The tracks given a scan."""
-        del key
         scan = compare_scan(self.model, state, measurement, valid, self.gate)
         return update_tracks(state, scan, self.marginals.associate(scan.log_odds, scan.log_missed), self.logic)
 

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxloc import _tree as tree
-from jaxloc.beliefs import Gaussian, chi2_quantile
+from jaxloc.beliefs import Gaussian, chi2_quantile, validity
 from jaxloc.filters import GaussianFilter, GaussianState, InteractingMultipleModel
-from jaxloc.tracking.gating import Comparison, compare, corrected, usable_measurements
+from jaxloc.tracking.gating import Comparison, compare, corrected, safe_measurements, usable_measurements
 from jaxloc.tracking.models.birth import StaticBirth
 from jaxloc.tracking.models.target import TargetModel
 from jaxloc.tracking.tracks import Tracks
@@ -50,6 +49,7 @@ class Scan(eqx.Module):
         newborn: new targets of the measurements.
         share: probability that an unassociated measurement is of a new target, ``b / (kappa + b)``.
         base: log likelihood of the scan if no track were detected.
+        usable: whether the sensor can measure any track.
     """
 
     measurements: Any
@@ -61,6 +61,7 @@ class Scan(eqx.Module):
     newborn: NewTargets
     share: Float[Array, " m"]
     base: Float[Array, ""]
+    usable: Bool[Array, ""]
 
 
 def compare_scan(
@@ -76,9 +77,9 @@ def compare_scan(
         gate: probability that a track's own measurement passes; None for no gate.
     """
     present = usable_measurements(measurements, valid)
-    measurements = tree.finite_or_zero(measurements)
-    likelihood, comparison = _likelihoods(model.filter, tracks.states, measurements, present, gate)
-    detection = _detection(model, tracks.means(), tracks.existence)
+    measurements = safe_measurements(measurements, present)
+    likelihood, comparison, usable = _likelihoods(model.filter, tracks.states, measurements, present, gate)
+    detection, known = _detection(model, tracks.means(), tracks.existence)
     newborn = initiate(model, tracks, measurements, present)
     clutter = jax.vmap(model.clutter.log_intensity)(measurements)
     false = jnp.maximum(jnp.logaddexp(clutter, newborn.log_intensity), _RAREST)
@@ -90,9 +91,8 @@ def compare_scan(
     missed = jnp.log(jnp.maximum(1.0 - seen, float(jnp.finfo(seen.dtype).eps)))
     share = jnp.where(present, jnp.exp(jnp.minimum(newborn.log_intensity - false, 0.0)), 0.0)
     base = jnp.sum(jnp.where(present, false, 0.0)) - model.clutter.rate - newborn.expected
-    return Scan(
-        measurements, present, comparison, detection, missed, jnp.where(inside, odds, -jnp.inf), newborn, share, base
-    )
+    odds, usable = jnp.where(inside, odds, -jnp.inf), jnp.any(usable & known)
+    return Scan(measurements, present, comparison, detection, missed, odds, newborn, share, base, usable)
 
 
 def initiate(model: TargetModel, tracks: Tracks, measurements: Any, present: Bool[Array, " m"]) -> NewTargets:
@@ -109,8 +109,10 @@ def initiate(model: TargetModel, tracks: Tracks, measurements: Any, present: Boo
         nothing = jnp.zeros((), tracks.existence.dtype)
         return NewTargets(states, jnp.full((num,), -jnp.inf, nothing.dtype), nothing)
     intensity = jax.vmap(model.birth.log_intensity)(measurements)
-    states = jax.vmap(lambda z: model.filter.init(model.birth.seed(z)))(measurements)
-    return NewTargets(states, jnp.where(present, intensity, -jnp.inf), model.birth.rate)
+    seeds = jax.vmap(model.birth.seed)(measurements)
+    good = present & jax.vmap(validity.usable)(seeds.mean, seeds.covariance)
+    states = jax.vmap(model.filter.init)(seeds)
+    return NewTargets(states, jnp.where(good, intensity, -jnp.inf), model.birth.rate)
 
 
 def _from_mixture(model: TargetModel, measurements: Any, present: Bool[Array, " m"]) -> NewTargets:
@@ -118,8 +120,8 @@ def _from_mixture(model: TargetModel, measurements: Any, present: Bool[Array, " 
     states = jax.vmap(lambda mean, covariance: model.filter.init(Gaussian(mean, covariance)))(
         mixture.means, mixture.covariances
     )
-    likelihood, comparison = _likelihoods(model.filter, states, measurements, present, None)
-    expected = mixture.weights * _detection(model, mixture.means, mixture.weights)
+    likelihood, comparison, _ = _likelihoods(model.filter, states, measurements, present, None)
+    expected = mixture.weights * _detection(model, mixture.means, mixture.weights)[0]
     possible = jnp.isfinite(likelihood) & (expected > 0.0)[:, None]
     scale = jnp.log(jnp.where(expected > 0.0, expected, 1.0))
     terms = jnp.where(possible, scale[:, None] + jnp.where(possible, likelihood, 0.0), -1e30)
@@ -144,16 +146,19 @@ def correct_tracks(
     return _correct(model.filter, tracks.states, scan.comparison, scan.measurements, scan.valid, rows, columns)
 
 
-def _detection(model: TargetModel, means: Any, like: Float[Array, " k"]) -> Float[Array, " k"]:
-    return jax.vmap(model.detection.probability)(means).astype(like.dtype)
+def _detection(
+    model: TargetModel, means: Any, like: Float[Array, " k"]
+) -> tuple[Float[Array, " k"], Bool[Array, " k"]]:
+    detection, known = model.detect(means)
+    return detection.astype(like.dtype), known
 
 
 def _likelihoods(
     filt: Any, states: Any, measurements: Any, present: Bool[Array, " m"], gate: float | None
-) -> tuple[Float[Array, "k m"], Comparison | None]:
+) -> tuple[Float[Array, "k m"], Comparison | None, Bool[Array, " k"]]:
     if isinstance(filt, GaussianFilter):
         comparison = compare(filt, states.mean, states.covariance_sqrt, measurements, present, gate)
-        return comparison.log_likelihood, comparison
+        return comparison.log_likelihood, comparison, comparison.usable
     if not isinstance(filt, InteractingMultipleModel):
         raise TypeError(
             f"Trackers need a filter of the Kalman family or InteractingMultipleModel; got {type(filt).__name__}."
@@ -161,16 +166,21 @@ def _likelihoods(
 
     def pair(state, z, here):
         _, info = filt.update(state, z, here)
-        return info.log_likelihood, jnp.min(info.modes.nis), info.modes.innovation
+        return (
+            info.log_likelihood,
+            jnp.min(info.modes.nis),
+            info.modes.innovation,
+            info.ok & jnp.all(info.modes.dof > 0),
+        )
 
     each = jax.vmap(lambda state: jax.vmap(lambda z, here: pair(state, z, here))(measurements, present))
-    likelihood, nis, innovations = each(states)
-    inside = jnp.broadcast_to(present[None, :], nis.shape)
+    likelihood, nis, innovations, usable = each(states)
+    inside = present[None, :] & usable
     if gate is not None:
         with jax.ensure_compile_time_eval():
             bound = float(chi2_quantile(gate, float(innovations.shape[-1])))
         inside = inside & (nis <= bound)
-    return jnp.where(inside, likelihood, -jnp.inf), None
+    return jnp.where(inside, likelihood, -jnp.inf), None, jnp.any(usable | ~present[None, :], axis=1)
 
 
 def _correct(

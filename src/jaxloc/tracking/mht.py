@@ -18,6 +18,7 @@ from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Mixture
 from jaxloc.filters import FilterState
+from jaxloc.filters.interface import conclude
 from jaxloc.tracking.interface import Targets, Tracker, TrackerInfo
 from jaxloc.tracking.likelihood_ratio import Scan, compare_scan, correct_tracks
 from jaxloc.tracking.models.target import TargetModel
@@ -142,15 +143,20 @@ class MultipleHypothesisTracker(Tracker):
     ) -> tuple[Hypotheses, TrackerInfo]:
         """The hypotheses given a scan; the likelihood is summed over the children found."""
         del key
+        ok, (after, info) = tree.protect(MultipleHypothesisTracker._updated, self, state, measurement, valid)
+        return conclude(ok, after, info, state)
+
+    def _updated(
+        self, state: Hypotheses, measurement: Any, valid: Bool[Array, " m"]
+    ) -> tuple[Bool[Array, ""], tuple[Hypotheses, TrackerInfo]]:
         scan = compare_scan(self.model, state.leaves, measurement, valid, self.gate)
         children = search(scan, state, self.beam)
         likelihood = scan.base + logsumexp(children.log_weights) - logsumexp(state.log_weights)
         children = jax.tree.map(lambda leaf: leaf[: self.hypotheses], children)
         after, crowded = _expand(self, state, scan, children)
         after = _resolve(after, self.logic)
-        ok = tree.all_finite((after, likelihood))
-        after = tree.where(ok, after, state)
-        return after, TrackerInfo(jnp.where(ok, likelihood, 0.0), ok, jnp.sum(after.shares()), crowded)
+        ok = tree.all_finite((after, likelihood)) & scan.usable & self.model.usable
+        return ok, (after, TrackerInfo(jnp.where(ok, likelihood, 0.0), ok, jnp.sum(after.shares()), crowded))
 
     def extract(self, state: Hypotheses) -> Targets:
         """The confirmed tracks of the best hypothesis; their probability is that of the tree."""

@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
 from jaxloc.beliefs.square_root import cholesky, product, triangularize
@@ -69,11 +69,8 @@ class ProbabilisticDataAssociation(TrackTable, Tracker):
     def __check_init__(self):
         require_gaussian(self.model, "ProbabilisticDataAssociation")
 
-    def update(
-        self, state: Tracks, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
-    ) -> tuple[Tracks, TrackerInfo]:
+    def associate_scan(self, state: Tracks, measurement: Any, valid: Bool[Array, " m"]) -> tuple[Tracks, TrackerInfo]:
         """The tracks given a scan."""
-        del key
         scan = compare_scan(self.model, state, measurement, valid, self.gate)
         return update_tracks(state, scan, associate_alone(scan.log_odds, scan.log_missed), self.logic)
 
@@ -125,7 +122,8 @@ def update_tracks(state: Tracks, scan: Scan, found: Association, logic: TrackLog
     left = miss(state.existence, scan.detection)
     hit = 1.0 - found.missed
     existence = hit + found.missed * left
-    divisor = jnp.where(existence > 0.0, existence, 1.0)
+    # The derivative by an existence of nearly zero overflows; such tracks are deleted.
+    divisor = jnp.where(existence > 1.0 / tree.largest(existence.dtype), existence, 1.0)
     moved = match_moments(state.states, scan.comparison, found.pairs / divisor[:, None])
     states = jax.vmap(tree.where)(jnp.any(found.pairs > 0.0, axis=1), moved, state.states)
     aged = age_tracks(state, states, existence, hit > 0.5)
@@ -133,8 +131,7 @@ def update_tracks(state: Tracks, scan: Scan, found: Association, logic: TrackLog
     newborn = jnp.where(unexplained > 0.5, unexplained * scan.share, 0.0)
     after, crowded = manage_tracks(aged, scan.newborn.states, newborn, logic)
     likelihood = scan.base + found.log_normalizer
-    ok = tree.all_finite((after, likelihood))
-    after = tree.where(ok, after, state)
+    ok = tree.all_finite((after, likelihood)) & scan.usable
     return after, TrackerInfo(jnp.where(ok, likelihood, 0.0), ok, jnp.sum(after.existence), crowded)
 
 

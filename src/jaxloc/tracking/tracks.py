@@ -9,10 +9,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
 from jaxloc.beliefs import Gaussian, Mixture
 from jaxloc.filters import FilterState
+from jaxloc.filters.interface import conclude
 from jaxloc.poses.lie_group import as_floats
-from jaxloc.tracking.interface import Targets
+from jaxloc.tracking.interface import Targets, TrackerInfo
 from jaxloc.tracking.models.birth import StaticBirth
 from jaxloc.tracking.models.target import TargetModel
 
@@ -180,9 +182,28 @@ class TrackTable(eqx.Module):
         del key
         return predict_tracks(self.model, state, control)
 
+    def update(
+        self, state: Tracks, measurement: Any, valid: Bool[Array, " m"], *, key: Key[Array, ""] | None = None
+    ) -> tuple[Tracks, TrackerInfo]:
+        """The tracks given a scan; as predicted where the scan cannot be used."""
+        del key
+        ok, (after, info) = tree.protect(_associated, self, state, measurement, valid)
+        return conclude(ok, after, info, state)
+
+    @abstractmethod
+    def associate_scan(self, state: Tracks, measurement: Any, valid: Bool[Array, " m"]) -> tuple[Tracks, TrackerInfo]:
+        """`update` without protection from non-finite numbers, which `update` adds."""
+
     def extract(self, state: Tracks) -> Targets:
         """The reported tracks."""
         return extract_tracks(state, self.logic)
+
+
+def _associated(
+    table: TrackTable, state: Tracks, measurement: Any, valid: Bool[Array, " m"]
+) -> tuple[Bool[Array, ""], tuple[Tracks, TrackerInfo]]:
+    after, info = table.associate_scan(state, measurement, valid)
+    return info.ok & table.model.usable, (after, info)
 
 
 def open_tracks(model: TargetModel, capacity: int, prior: Mixture | None, logic: TrackLogic) -> Tracks:
@@ -204,7 +225,7 @@ def open_tracks(model: TargetModel, capacity: int, prior: Mixture | None, logic:
         raise ValueError("There is no example of a state; give Mixture.empty(1, example) with any state.")
     if prior.capacity > capacity:
         raise ValueError(f"The prior has {prior.capacity} components, but the table has {capacity} slots.")
-    padded = prior.check().padded(capacity)
+    padded = prior.check().usable().padded(capacity)
     existence = jnp.minimum(padded.weights, 1.0)
     there = existence > 0.0
     labels = jnp.where(there, jnp.cumsum(there, dtype=jnp.int32) - 1, NO_LABEL)
@@ -221,7 +242,7 @@ def open_tracks(model: TargetModel, capacity: int, prior: Mixture | None, logic:
 def predict_tracks(model: TargetModel, tracks: Tracks, control: Any) -> Tracks:
     """Every track predicted one step ahead; existence is multiplied by the survival probability."""
     states = jax.vmap(lambda state: model.filter.predict(state, control))(tracks.states)
-    existence = tracks.existence * model.survival.astype(tracks.existence.dtype)
+    existence = tracks.existence * model.survival_probability().astype(tracks.existence.dtype)
     return eqx.tree_at(lambda t: (t.states, t.existence, t.step), tracks, (states, existence, tracks.step + 1))
 
 

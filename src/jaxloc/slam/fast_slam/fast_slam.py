@@ -10,9 +10,10 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc import _tree as tree
 from jaxloc._linalg import matmul
-from jaxloc.beliefs import Gaussian, Motion, Particles, resampling
-from jaxloc.filters.interface import Filter, Info
+from jaxloc.beliefs import Gaussian, Motion, Particles, resampling, validity
+from jaxloc.filters.interface import Filter, Info, conclude
 from jaxloc.poses import SE2
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors.landmarks import RangeBearing, sanitize
@@ -93,10 +94,14 @@ class FastSlam(Filter):
         return LandmarkFilter(self.deviations, self.mount)
 
     def init(self, prior: Gaussian) -> FastSlamState:
-        """Initial state: particles at the mean of the prior; its covariance is sampled at the first reading."""
-        n, dtype, size = self.num_particles, prior.covariance.dtype, self.proposal.num_pending(self.capacity)
-        pending = jnp.zeros((size, size), dtype).at[:3, :3].set(prior.covariance)
-        one = (prior.mean, pending, Landmarks.empty(self.capacity, dtype))
+        """Initial state: particles at the mean of the prior; its covariance is sampled at the first reading.
+
+        Updates are not ``ok`` where the prior is no density.
+        """
+        mean, covariance = validity.usable_or_unknown(prior.mean, prior.covariance)
+        n, dtype, size = self.num_particles, covariance.dtype, self.proposal.num_pending(self.capacity)
+        pending = jnp.zeros((size, size), dtype).at[:3, :3].set(covariance)
+        one = (mean, pending, Landmarks.empty(self.capacity, dtype))
         poses, pending, maps = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), one)
         weights = jnp.full(n, -math.log(n), dtype)
         return FastSlamState(poses, pending, maps, weights, jnp.zeros((), jnp.int32))
@@ -105,14 +110,20 @@ class FastSlam(Filter):
     def predict(self, state: FastSlamState, control: Any, *, key: Key[Array, ""] | None = None) -> FastSlamState:
         """Predicts all particles; the motion noise stays pending until the next reading.
 
+        An increment that is not finite counts as no motion; one that overflows leaves the particles unchanged.
+
         Raises:
             ValueError: without a key, where the proposal draws between readings.
         """
+        if key is None and self.proposal.draws_now(state.step) is not None:
+            raise ValueError("FastSlam.predict draws poses: pass key=jax.random.key(...), as to run(..., key=key).")
+        ok, moved = tree.protect(FastSlam._moved, self, state, validity.finite_or_neutral(control), key)
+        return tree.where(ok, moved, eqx.tree_at(lambda s: s.step, state, state.step + 1))
+
+    def _moved(self, state: FastSlamState, control: Any, key: Array | None) -> tuple[Bool[Array, ""], FastSlamState]:
         particles = jax.vmap(Particle)(state.poses, state.pending, state.maps)
         due = self.proposal.draws_now(state.step)
         if due is not None:
-            if key is None:
-                raise ValueError("FastSlam.predict draws poses: pass key=jax.random.key(...), as to run(..., key=key).")
             normal = jax.random.normal(key, state.pending.shape[:2], state.pending.dtype)
             particles = lax.cond(due, lambda: jax.vmap(self.proposal.draw)(particles, normal), lambda: particles)
 
@@ -123,7 +134,8 @@ class FastSlam(Filter):
             return moved, pending.at[:3, :3].add(self.motion.covariance(pose, control))
 
         poses, pending = jax.vmap(move)(particles.pose, particles.pending)
-        return FastSlamState(poses, pending, particles.known, state.log_weights, state.step + 1)
+        moved = FastSlamState(poses, pending, particles.known, state.log_weights, state.step + 1)
+        return _is_usable(moved), moved
 
     @eqx.filter_jit
     def update(
@@ -158,6 +170,17 @@ class FastSlam(Filter):
         """
         if key is None:
             raise ValueError("FastSlam.update draws particles: pass key=jax.random.key(...), as to run(..., key=key).")
+        ok, (after, info) = tree.protect(FastSlam._updated, self, state, measurement, valid, candidates, key)
+        return conclude(ok, after, info, state)
+
+    def _updated(
+        self,
+        state: FastSlamState,
+        measurement: RangeBearing,
+        valid: Bool[Array, ""],
+        candidates: Candidates,
+        key: Array,
+    ) -> tuple[Bool[Array, ""], tuple[FastSlamState, FastSlamInfo]]:
         key_draw, key_resample = jax.random.split(key)
         reading, usable = sanitize(measurement, valid & (measurement.landmark < self.capacity))
         normal = jax.random.normal(key_draw, state.pending.shape[:2], state.pending.dtype)
@@ -169,7 +192,7 @@ class FastSlam(Filter):
         found = update_particle(self.landmark_filter, before, observation, normal)
         joint = state.log_weights + found.log_density
         total = logsumexp(joint)
-        fine = usable & jnp.isfinite(total)
+        fine = usable & jnp.isfinite(total) & tree.all_finite(found.particle)
         weights = jnp.where(fine, joint - jnp.where(fine, total, 0.0), state.log_weights)
         ess = Particles(state.poses, weights).ess
         resampled = fine & (ess < self.ess_threshold * self.num_particles)
@@ -186,7 +209,13 @@ class FastSlam(Filter):
             ancestors=ancestors,
             landmark=jnp.where(fine, found.row, -1),
         )
-        return FastSlamState(after.pose, after.pending, after.known, weights, state.step), info
+        after = FastSlamState(after.pose, after.pending, after.known, weights, state.step)
+        deviations = tree.within_range((self.deviations**2, 1.0 / self.deviations))
+        return info.ok & _is_usable(state) & deviations, (after, info)
+
+
+def _is_usable(state: FastSlamState) -> Bool[Array, ""]:
+    return tree.within_range((state.poses, state.pending, state.maps))
 
 
 @eqx.filter_jit

@@ -79,7 +79,9 @@ class LandmarkFilter(eqx.Module):
 
     def log_floor(self) -> Float[Array, ""]:
         """Log density of a reading of no known landmark, uniform and equal for all particles."""
-        return math.log1p(-LIKELY) - jnp.sum(jnp.log(self.deviations)) - math.log(2.0 * math.pi)
+        positive = (self.deviations > 0.0) & jnp.isfinite(self.deviations)
+        logs = jnp.log(jnp.where(positive, self.deviations, 1.0))
+        return math.log1p(-LIKELY) - jnp.sum(logs) - math.log(2.0 * math.pi)
 
     def predict(
         self, pose: SE2, mean: Float[Array, "2"], covariance: Float[Array, "2 2"], reading: RangeBearing

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxloc.beliefs import Gaussian, Mixture
 from jaxloc.poses.lie_group import as_floats
+from jaxloc.tracking.models.clutter import log_rate
 
 
 class Birth(eqx.Module):
@@ -77,7 +78,7 @@ class MeasuredBirth(Birth):
     def log_intensity(self, measurement: Any) -> Float[Array, ""]:
         """``log (rate / volume)``."""
         del measurement
-        return jnp.log(self.rate) - jnp.log(self.volume)
+        return log_rate(self.rate) - jnp.log(self.volume)
 
     @abstractmethod
     def seed(self, measurement: Any) -> Gaussian:

@@ -28,7 +28,19 @@ class Clutter(eqx.Module):
 
     def log_intensity(self, measurement: Any) -> Float[Array, ""]:
         """``log kappa(z)``."""
-        return jnp.log(self.rate) + self.log_density(measurement)
+        return log_rate(self.rate) + self.log_density(measurement)
+
+
+def log_rate(rate: Float[Array, ""]) -> Float[Array, ""]:
+    """Logarithm of a rate, with a finite derivative at zero, where it is minus infinity.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> float(log_rate(jnp.array(0.0))), float(jax.grad(log_rate)(0.0))
+        (-inf, 0.0)
+    """
+    none = rate == 0.0
+    return jnp.where(none, -jnp.inf, jnp.log(jnp.where(none, 1.0, rate)))
 
 
 class UniformClutter(Clutter):

@@ -4,14 +4,15 @@ from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxloc.filters import Filter
 from jaxloc.poses import SE3
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.sensors import Pinhole
-from jaxloc.tracking.models.birth import Birth
+from jaxloc.tracking.models.birth import Birth, MeasuredBirth
 from jaxloc.tracking.models.clutter import Clutter
 
 
@@ -100,3 +101,32 @@ class TargetModel(eqx.Module):
         self.filter, self.clutter, self.birth = filter, clutter, birth
         self.detection = detection if isinstance(detection, Detection) else ConstantDetection(detection)
         (self.survival,) = as_floats(survival)
+
+    @property
+    def usable(self) -> Bool[Array, ""]:
+        """Whether survival is a probability, and rates are rates; updates are not ``ok`` where they are not."""
+        rates = [self.clutter.rate, *([self.birth.rate] if isinstance(self.birth, MeasuredBirth) else [])]
+        fine = [(rate >= 0.0) & jnp.isfinite(rate) for rate in rates]
+        return is_probability(self.survival) & jnp.all(jnp.stack(fine))
+
+    def survival_probability(self) -> Float[Array, ""]:
+        """p_S within [0, 1]; one where it is NaN."""
+        bound = jnp.where(self.survival < 0.0, 0.0, 1.0).astype(self.survival.dtype)
+        return jnp.where(is_probability(self.survival), self.survival, bound)
+
+    def detect(self, states: Any) -> tuple[Float[Array, " k"], Bool[Array, " k"]]:
+        """p_D of stacked states, zero where it is no probability; and where it is one."""
+        found = jax.vmap(self.detection.probability)(states)
+        good = is_probability(found)
+        return jnp.where(good, found, 0.0), good
+
+
+def is_probability(value: Float[Array, "*k"]) -> Bool[Array, "*k"]:
+    """Whether numbers are between 0 and 1.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> is_probability(jnp.array([0.5, 1.5, jnp.nan])).tolist()
+        [True, False, False]
+    """
+    return (value >= 0.0) & (value <= 1.0)
