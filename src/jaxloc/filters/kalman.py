@@ -251,13 +251,12 @@ def noise_root(
 
     Directions without a finite variance are masked; all are where the covariance of the others is indefinite.
     """
-    known = jnp.sqrt(jnp.abs(lax.stop_gradient(covariance)))
-    mask = mask & (jnp.diagonal(known) < tree.largest(known.dtype))
-    finite = jnp.where(jnp.isfinite(covariance), covariance, 0.0)
-    masked = mask_covariance(finite, mask)
-    root = cholesky(masked)
-    sound = validity.factors(root, masked)
-    return jnp.where(sound, root, jnp.eye(mask.shape[0], dtype=root.dtype)), mask & sound
+    known = jnp.sqrt(jnp.abs(lax.stop_gradient(jnp.diagonal(covariance)))) < tree.largest(covariance.dtype)
+    finite = mask_covariance(jnp.where(jnp.isfinite(covariance), covariance, 0.0), known)
+    # Without the mask, which differs from one batch entry to the next: checked once where all have one covariance.
+    sound = validity.factors(cholesky(lax.stop_gradient(finite)), finite)
+    mask = mask & known & sound
+    return cholesky(mask_covariance(finite, mask)), mask
 
 
 def innovation_info(root: Float[Array, "n n"], found: Innovation, gate: float | None = None) -> GaussianInfo:
