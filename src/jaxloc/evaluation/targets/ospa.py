@@ -248,7 +248,7 @@ def _usable_cutoff(cutoff: Float[Array, ""], order: float) -> tuple[Float[Array,
 def _distances(
     x: Float[Array, "n d"], y: Float[Array, "m d"], cutoff: Float[Array, ""], order: float
 ) -> Float[Array, "n m"]:
-    """Euclidean distances to a power; infinite where a number is not finite or the distance is well above the cutoff."""
+    """Euclidean distances to a power; infinite where a number is not finite, or well above the cutoff."""
     # Squares of larger numbers overflow.
     largest = 1e-3 * float(jnp.finfo(x.dtype).max) ** 0.5
     finite = [jnp.all(jnp.abs(points) < largest, axis=1) for points in (x, y)]
