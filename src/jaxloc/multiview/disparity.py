@@ -122,6 +122,8 @@ def box_mean(image: Float[Array, "h w"], size: int) -> Float[Array, "h w"]:
         >>> round(float(box_mean(jnp.eye(3), 3)[1, 1]), 3)
         0.333
     """
+    if not image.size:
+        return image
     half, (height, width) = size // 2, image.shape
     padded = jnp.pad(image, half, mode="edge")
     rows = sum(padded[i : i + height] for i in range(size))
@@ -236,6 +238,8 @@ def match(
     """
     if left.shape != right.shape:
         raise ValueError(f"Images of a pair have one shape; these have {left.shape} and {right.shape}.")
+    if not left.size:
+        raise ValueError(f"Images of a pair have at least one pixel; these have shape {left.shape}.")
     return matcher.match(left, right)
 
 

@@ -82,8 +82,9 @@ def direct_linear_transform(
     one, zero = valid.astype(u.dtype), jnp.zeros_like(u)
     rows_u = jnp.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
     rows_v = jnp.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)
-    # Four points give eight rows; a ninth of zeros keeps the null vector in the thin decomposition.
-    rows = jnp.concatenate([rows_u, rows_v, jnp.zeros_like(rows_u[:1])])
+    # Four points give eight rows; zeros up to nine keep the null vector in the thin decomposition.
+    missing = jnp.zeros((max(9 - 2 * points.shape[1], 1), 9), u.dtype)
+    rows = jnp.concatenate([rows_u, rows_v, missing])
     _, _, right = _linalg.svd(rows)
     matrix = matmul(_denormalizer(to_pixels), matmul(right[8].reshape(3, 3), to_points))
     norm = jnp.sqrt(jnp.sum(matrix * matrix))

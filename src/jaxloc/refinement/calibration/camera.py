@@ -112,9 +112,11 @@ def check_corners(board: Array, *images: Array) -> None:
     """Checks that images show the corners of the board.
 
     Raises:
-        ValueError: if the numbers of corners differ.
+        ValueError: if the numbers of corners differ, or there are no images.
     """
     for corners in images:
+        if not corners.size:
+            raise ValueError(f"Calibration needs images with corners; their array has shape {corners.shape}.")
         if corners.shape[1] != board.shape[0]:
             raise ValueError(
                 f"The board has {board.shape[0]} corners, the images {corners.shape[1]}: give every image all "

@@ -171,8 +171,14 @@ def strongest_edges(profile: Float[Array, " w"], count: int) -> Peaks:
 
 
 def peak_near(profile: Float[Array, " w"], column: Float[Array, ""], radius: int) -> Peaks:
-    """The highest peak of a profile within some pixels of a column, as a set of one."""
+    """The highest peak of a profile within some pixels of a column, as a set of one.
+
+    Raises:
+        ValueError: a profile without pixels.
+    """
     width = profile.shape[0]
+    if not width:
+        raise ValueError("peak_near: a profile without pixels.")
     places = jnp.arange(width, dtype=profile.dtype)
     near = jnp.abs(places - lax.stop_gradient(column)) <= radius
     index = jnp.argmax(lax.stop_gradient(jnp.where(near, profile, -jnp.inf)))
