@@ -169,6 +169,9 @@ NAMED = {
 def array_of(annotation, sizes):
     """An array of given sizes of named axes: without items, but with pixels, where not given otherwise."""
 
+    # Points of any dimension k.
+    sizes = {"k": 3, **sizes} if annotation.dim_str == "n k" else sizes
+
     def size(name):
         return int(name) if name.isdigit() else sizes.get(name, 0 if name in SETS else PIXELS.get(name, 3))
 

@@ -29,7 +29,9 @@ def without_items():
 
 @pytest.mark.parametrize("loss", [Quadratic(), Huber(1.5), GemanMcClure(2.0)], ids=lambda loss: type(loss).__name__)
 @pytest.mark.parametrize(
-    "solver", [GaussNewton(), GaussNewton(QR()), LevenbergMarquardt(), Dogleg()], ids=lambda s: str(type(s).__name__)
+    "solver",
+    [GaussNewton(), GaussNewton(linear_solver=QR()), LevenbergMarquardt(), Dogleg()],
+    ids=lambda s: str(type(s).__name__),
 )
 def test_nothing_is_not_ok(solver, loss):
     fit = solve(FunctionProblem(residual, without_items(), loss), SE2(1.0, 2.0, 0.5), solver=solver)
