@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc.poses import SE3
 from jaxloc.refinement.reprojection import Reprojection
 from jaxloc.sensors import Pinhole
@@ -13,6 +14,7 @@ from jaxloc.solvers import Estimate, GaussNewton, Quadratic, Solver, solve
 
 
 @eqx.filter_jit
+@checked
 def refine_pose(
     camera: Pinhole,
     points_world: Float[Array, "n 3"],

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.sensors import Pinhole, StereoRig
@@ -165,6 +166,7 @@ def _pixel_jacobian(camera: Pinhole, c: tuple[Array, Array, Array], weight: Any 
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
+@checked
 def stereo_jacobian(rig: StereoRig, c: tuple[Array, Array, Array]) -> Float[Array, "3 3 n"]:
     """Derivative of (u_left, u_right, v) with respect to the point: direction first, then component."""
     pixel = _pixel_jacobian(rig.camera, c)
@@ -216,6 +218,7 @@ def _lower_product(lower: Float[Array, "3 3 n"], vector: Float[Array, "3 n"]) ->
 
 
 @eqx.filter_jit
+@checked
 def whitener(covariances: Float[Array, "n 3 3"]) -> Float[Array, "3 3 n"]:
     """Inverse Cholesky factors of many 3x3 covariances, unrolled, points along the last axis.
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration.model import Intrinsics, Parametrization
@@ -34,6 +35,7 @@ class Calibrated(eqx.Module):
 
 
 @eqx.filter_jit
+@checked
 def calibrate(
     board: Float[Array, "corners 3"],
     corners: Float[Array, "boards corners 2"],
