@@ -58,7 +58,7 @@ class Reprojection(Problem):
         predicted = jnp.stack(self.camera.project_components(*c))
         # Weight and mask are applied to the smallest arrays.
         weight = jnp.where(visible, 1.0 / self.sigma, 0.0)
-        jacobian = _pose_jacobian(_pixel_jacobian(self.camera, c, weight), self._levers(state, c))
+        jacobian = _pose_jacobian(_pixel_jacobian(self.camera, c, weight), self._levers(c))
         return Linearization(_mask(predicted - self.pixels, visible, self.valid, 1.0 / self.sigma), jacobian)
 
     def admissible(self, state: SE3) -> Bool[Array, ""]:
@@ -73,14 +73,13 @@ class Reprojection(Problem):
             error = (jnp.stack(self.camera.project_components(*c)) - self.pixels) / self.sigma
             return jnp.where(visible, self.loss.rho(jnp.sum(error**2, axis=0)), 0.0)
 
-        return _rigid_hessian(item_cost, c, self._levers(state, c))
+        return _rigid_hessian(item_cost, c, self._levers(c))
 
-    def _levers(self, state: SE3, c: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def _levers(self, c: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         """The points in the frame of the state, about whose origin it turns."""
         if self.center is None:
             return c
-        moved = matmul(state.rotation.matrix().T, self.points - state.translation[:, None])
-        return moved[0], moved[1], moved[2]
+        return c[0] - self.center[0], c[1] - self.center[1], c[2] - self.center[2]
 
 
 class StereoReprojection(Problem):
