@@ -98,8 +98,9 @@ def _refuse_vague(fit: Estimate, covariance: Float[Array, "6 6"], mean: Float[Ar
     vague = (jnp.sum(variance[3:]) > 1.0) | (jnp.sum(variance[:3]) > jnp.sum(distance * distance))
     ok = fit.ok & ~vague
     status = jnp.where(fit.ok & vague, int(Status.RANK_DEFICIENT), fit.status)
-    value, covariance = tree.detach_unless(ok, (fit.value, fit.covariance))
-    return Estimate(value, covariance, fit.cost, ok, fit.num_steps, status, fit.information)
+    found = fit.value, fit.covariance, fit.cost, fit.information
+    value, covariance, cost, information = tree.detach_unless(ok, found)
+    return Estimate(value, covariance, cost, ok, fit.num_steps, status, information)
 
 
 def _about_camera(fit: Estimate, center: Float[Array, "3"]) -> Estimate:
