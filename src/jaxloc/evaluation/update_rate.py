@@ -186,12 +186,17 @@ def find_minimum(spacing: Float[Array, " n"], error: Float[Array, " n"]) -> Floa
     Returns:
         The spacing of the least error.
 
+    Raises:
+        ValueError: fewer than five spacings, or another number of errors.
+
     Example:
         >>> import jax.numpy as jnp
         >>> d = jnp.linspace(0.3, 3.0, 20)
         >>> round(float(find_minimum(d, 1.0 / jnp.sqrt(d) + 0.5 * d)), 1)
         1.0
     """
+    if spacing.shape[0] < 5 or spacing.shape != error.shape:
+        raise ValueError(f"A cubic fit needs five errors or more, one a spacing; got {error.shape} of {spacing.shape}.")
     place = jnp.log(spacing)
     middle, half = 0.5 * (jnp.max(place) + jnp.min(place)), 0.5 * (jnp.max(place) - jnp.min(place))
     coefficients = jnp.polyfit((place - middle) / half, jnp.log(error), 3)

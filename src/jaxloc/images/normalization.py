@@ -30,10 +30,15 @@ def as_gray(image: Num[Array, "h w"] | Any, dtype: Any = None) -> Float[Array, "
         >>> import jax.numpy as jnp
         >>> as_gray(jnp.array([[200]], jnp.uint8)).tolist()
         [[200.0]]
+
+    Raises:
+        ValueError: no gray image, or one without pixels.
     """
     image = jnp.asarray(image)
     if image.ndim != 2:
         raise ValueError(f"A grayscale image has two axes (rows, columns); got an array of shape {image.shape}.")
+    if not image.size:
+        raise ValueError(f"An image has at least one pixel; got an array of shape {image.shape}.")
     if dtype is None:
         dtype = image.dtype if jnp.issubdtype(image.dtype, jnp.floating) else jnp.result_type(float)
     return image.astype(dtype)

@@ -9,6 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._arguments import checked
 from jaxloc.features import subpixel
 from jaxloc.features.opencv import backend
 
@@ -46,6 +47,7 @@ class WindowCost(eqx.Module):
 class SSD(WindowCost):
     """Mean squared difference of gray levels [R-44]."""
 
+    @checked
     def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
         """The image."""
         del size
@@ -65,6 +67,7 @@ class ZNCC(WindowCost):
 
     least_contrast: float = eqx.field(static=True, default=1.0)
 
+    @checked
     def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
         """The centered image, with mean and inverse standard deviation of each window."""
         centered = image - jnp.mean(image)
@@ -91,6 +94,7 @@ class Census(WindowCost):
 
     radius: tuple[int, int] = eqx.field(static=True, default=(3, 4))
 
+    @checked
     def prepare(self, image: Float[Array, "h w"], size: int) -> Any:
         """Comparisons of the neighbors with the center pixel, 31 bits an integer."""
         del size
@@ -114,6 +118,7 @@ class Census(WindowCost):
         return box_mean(differ.astype(jnp.float32) / count, size)
 
 
+@checked
 def box_mean(image: Float[Array, "h w"], size: int) -> Float[Array, "h w"]:
     """Mean of the size x size window about each pixel; the edge is repeated outside.
 
@@ -122,6 +127,8 @@ def box_mean(image: Float[Array, "h w"], size: int) -> Float[Array, "h w"]:
         >>> round(float(box_mean(jnp.eye(3), 3)[1, 1]), 3)
         0.333
     """
+    if not image.size:
+        return image
     half, (height, width) = size // 2, image.shape
     padded = jnp.pad(image, half, mode="edge")
     rows = sum(padded[i : i + height] for i in range(size))
@@ -236,6 +243,8 @@ def match(
     """
     if left.shape != right.shape:
         raise ValueError(f"Images of a pair have one shape; these have {left.shape} and {right.shape}.")
+    if not left.size:
+        raise ValueError(f"Images of a pair have at least one pixel; these have shape {left.shape}.")
     return matcher.match(left, right)
 
 
@@ -323,6 +332,7 @@ class DenseRefinement(eqx.Module):
 
 
 @eqx.filter_jit
+@checked
 def refine(
     left: Float[Array, "h w"],
     right: Float[Array, "h w"],

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc import _linalg
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3, Direction
 from jaxloc.poses.lie_group import skew
@@ -33,6 +34,7 @@ class RelativePose(eqx.Module):
     rotation: SO3
 
     @staticmethod
+    @checked
     def of(pose: SE3) -> "RelativePose":
         """The rotation and direction of translation of a pose."""
         return RelativePose(Direction.from_vector(pose.translation), pose.rotation)
@@ -46,6 +48,7 @@ class RelativePose(eqx.Module):
         return SE3(self.rotation, self.direction.vector * length)
 
 
+@checked
 def fundamental(essential: Float[Array, "3 3"], first: Pinhole, second: Pinhole) -> Float[Array, "3 3"]:
     """``F = K1^-T E K2^-1``, for undistorted pixels, of unit Frobenius norm.
 
@@ -62,12 +65,14 @@ def fundamental(essential: Float[Array, "3 3"], first: Pinhole, second: Pinhole)
     return matrix / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
 
 
+@checked
 def homogeneous(points: Float[Array, "n 2"]) -> Float[Array, "3 n"]:
     """Homogeneous coordinates, points along the last axis."""
     return jnp.concatenate([points.T, jnp.ones_like(points.T[:1])])
 
 
 @eqx.filter_jit
+@checked
 def epipolar_lines(matrix: Float[Array, "3 3"], second: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
     """Lines ``a u + b v + c = 0`` of the first image on which points of the second lie; ``a^2 + b^2 = 1``.
 
@@ -88,6 +93,7 @@ def epipolar_lines(matrix: Float[Array, "3 3"], second: Float[Array, "n 2"]) -> 
 
 
 @eqx.filter_jit
+@checked
 def epipoles(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Images of each camera's center in the other view: unit homogeneous points with ``e1^T M = 0``, ``M e2 = 0``.
 
@@ -109,6 +115,7 @@ def epipoles(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Arra
     return null_vector(matrix.T)[0], null_vector(matrix)[0]
 
 
+@checked
 def null_vector(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
     """Unit vector orthogonal to the rows of a matrix of rank two, and whether its rank is at least two.
 
@@ -125,6 +132,7 @@ def null_vector(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Bool[Ar
     return vector / jnp.sqrt(jnp.where(known, squares[best], 1.0)), known
 
 
+@checked
 def unit_rays(rays: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     """Rays normalized to length one; zero where not finite."""
     rays = jnp.where(jnp.all(jnp.isfinite(rays), axis=1, keepdims=True), rays, 0.0)
@@ -132,6 +140,7 @@ def unit_rays(rays: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     return rays / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
 
 
+@checked
 def depth_signs(
     direction: Float[Array, "3"], first: Float[Array, "n 3"], second: Float[Array, "n 3"]
 ) -> Float[Array, "2 n"]:
@@ -146,6 +155,7 @@ def depth_signs(
     return jnp.stack([jnp.sum(jnp.cross(shift, other) * normal, axis=1) for other in (second, first)])
 
 
+@checked
 def coplanarity(
     matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "n 2"]
 ) -> Float[Array, " n"]:
@@ -173,6 +183,7 @@ def sampson_components(matrix: Array, x1: Float[Array, "3 n"], x2: Float[Array, 
 
 
 @eqx.filter_jit
+@checked
 def sampson_distance(
     matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "n 2"]
 ) -> Float[Array, " n"]:
@@ -197,6 +208,7 @@ def sampson_distance(
 
 
 @eqx.filter_jit
+@checked
 def symmetric_distance(
     matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "n 2"]
 ) -> Float[Array, " n"]:
@@ -220,6 +232,7 @@ def symmetric_distance(
 
 
 @eqx.filter_jit
+@checked
 def epipolar_gate(
     matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "m 2"], *, band: Any = 2.0
 ) -> Bool[Array, "n m"]:

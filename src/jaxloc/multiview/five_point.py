@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc import _linalg
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.multiview.epipolar import RelativePose, depth_signs, null_vector, unit_rays
 from jaxloc.poses import SO3, Direction, retract
@@ -59,6 +60,7 @@ class RelativePoses(NamedTuple):
 
 
 @eqx.filter_jit
+@checked
 def five_point(first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> RelativePoses:
     """Relative poses of two calibrated views of five points: up to ten essential matrices.
 
@@ -94,6 +96,7 @@ def five_point(first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> Relat
     return RelativePoses(poses, valid & _is_first(poses, valid))
 
 
+@checked
 def essential_candidates(
     first: Float[Array, "h 5 3"], second: Float[Array, "h 5 3"]
 ) -> tuple[Float[Array, "10 h 3 3"], Bool[Array, "10 h"]]:
@@ -253,6 +256,7 @@ def _quotient(top: tuple[Array, Array], bottom: tuple[Array, Array]) -> tuple[Ar
     return (top[0] * bottom[0] + top[1] * bottom[1]) * inverse, (top[1] * bottom[0] - top[0] * bottom[1]) * inverse
 
 
+@checked
 def decompose(essential: Float[Array, "3 3"]) -> RelativePose:
     """One of the four poses of an essential matrix; `facing` chooses among them.
 
@@ -283,6 +287,7 @@ def _axis(vector: Float[Array, "3"], fallback: int) -> Float[Array, "3"]:
     return safe / jnp.sqrt(jnp.where(some, squared, 1.0))
 
 
+@checked
 def facing(
     pose: RelativePose,
     first: Float[Array, "n 3"],
@@ -321,6 +326,7 @@ def _coplanarities(pose: RelativePose, first: Array, second: Array) -> Float[Arr
     return jnp.sum(first * matmul(second, pose.essential().T), axis=1)
 
 
+@checked
 def polish(pose: RelativePose, first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> RelativePose:
     """Newton steps on the manifold: five equations, five unknowns."""
     zero = jnp.zeros(5, first.dtype)

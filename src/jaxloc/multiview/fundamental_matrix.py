@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc import _linalg
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.multiview.epipolar import homogeneous
 from jaxloc.multiview.homography import normalizer
@@ -47,6 +48,7 @@ class FundamentalMatrices(eqx.Module):
 
 
 @eqx.filter_jit
+@checked
 def eight_point(
     first: Float[Array, "n 2"],
     second: Float[Array, "n 2"],
@@ -108,6 +110,7 @@ def eight_point(
 
 
 @eqx.filter_jit
+@checked
 def seven_point(first: Float[Array, "7 2"], second: Float[Array, "7 2"]) -> FundamentalMatrices:
     """Seven-point algorithm: one to three fundamental matrices.
 

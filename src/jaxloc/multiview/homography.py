@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc import _linalg
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc._tree import detach_unless
 from jaxloc.images import Homography
@@ -26,6 +27,7 @@ _SAMPLE = 4
 
 
 @eqx.filter_jit
+@checked
 def plane_homography(
     first: Pinhole, second: Pinhole, T_first_second: SE3, normal: Direction, distance: Float[Array, ""]
 ) -> Homography:
@@ -60,6 +62,7 @@ def plane_homography(
     return Homography.from_matrix(matmul(second.matrix(), matmul(moved, _inverse(first))))
 
 
+@checked
 def direct_linear_transform(
     points: Float[Array, "2 m"], pixels: Float[Array, "2 m"], valid: Bool[Array, " m"]
 ) -> Float[Array, "3 3"]:
@@ -82,8 +85,9 @@ def direct_linear_transform(
     one, zero = valid.astype(u.dtype), jnp.zeros_like(u)
     rows_u = jnp.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
     rows_v = jnp.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)
-    # Four points give eight rows; a ninth of zeros keeps the null vector in the thin decomposition.
-    rows = jnp.concatenate([rows_u, rows_v, jnp.zeros_like(rows_u[:1])])
+    # Four points give eight rows; zeros up to nine keep the null vector in the thin decomposition.
+    missing = jnp.zeros((max(9 - 2 * points.shape[1], 1), 9), u.dtype)
+    rows = jnp.concatenate([rows_u, rows_v, missing])
     _, _, right = _linalg.svd(rows)
     matrix = matmul(_denormalizer(to_pixels), matmul(right[8].reshape(3, 3), to_points))
     norm = jnp.sqrt(jnp.sum(matrix * matrix))
@@ -91,6 +95,7 @@ def direct_linear_transform(
     return jnp.where(good, matrix / jnp.where(good, norm, 1.0), jnp.eye(3, dtype=u.dtype))
 
 
+@checked
 def normalizer(
     points: Float[Array, "2 m"], valid: Bool[Array, " m"]
 ) -> tuple[Float[Array, "3 3"], Float[Array, "2 m"]]:
@@ -126,6 +131,7 @@ def _inverse(camera: Pinhole) -> Float[Array, "3 3"]:
 
 
 @eqx.filter_jit
+@checked
 def four_points(first: Float[Array, "4 2"], second: Float[Array, "4 2"]) -> Homography:
     """Homography of four point pairs: exact, smooth, without linear solver.
 
@@ -192,6 +198,7 @@ class TransferError(Problem):
         return transfer_error(state.homogeneous, self.first, self.second, self.sigma, self.valid)
 
 
+@checked
 def transfer_error(
     matrix: Float[Array, "3 3"],
     first: Float[Array, "2 n"],
@@ -232,6 +239,7 @@ def _distance(model: Homography, data: tuple[Array, Array, Array]) -> Float[Arra
 
 
 @eqx.filter_jit
+@checked
 def estimate_homography(
     first: Float[Array, "n 2"],
     second: Float[Array, "n 2"],

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc.poses import SE3, SO3
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -20,6 +21,7 @@ class MinimalPoses(eqx.Module):
 
 
 @eqx.filter_jit
+@checked
 def p3p(rays: Float[Array, "3 3"], points_world: Float[Array, "3 3"]) -> MinimalPoses:
     """Camera poses from three points and their rays: up to four.
 

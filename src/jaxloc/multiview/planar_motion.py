@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc.multiview.epipolar import depth_signs, unit_rays
 from jaxloc.multiview.p3p import MinimalPoses
 from jaxloc.poses import SE3, SO3
@@ -16,6 +17,7 @@ _POLISH_STEPS = 4
 
 
 @eqx.filter_jit
+@checked
 def planar_relative(first: Float[Array, "2 3"], second: Float[Array, "2 3"]) -> MinimalPoses:
     """Relative poses of a level camera that moves on a flat floor, from two correspondences: up to two.
 

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.images import Homography
 from jaxloc.multiview.epipolar import null_vector
@@ -30,6 +31,7 @@ class Rectification(eqx.Module):
 
 
 @eqx.filter_jit
+@checked
 def rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, *, shape: tuple[int, int]) -> Rectification:
     """Rectifies two calibrated cameras: epipoles at infinity, corresponding points in equal rows.
 
@@ -76,6 +78,7 @@ def rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, *, shape: tuple[in
 
 
 @eqx.filter_jit
+@checked
 def rectification_map(
     camera: Pinhole, rotation: SO3, target: Pinhole, *, shape: tuple[int, int]
 ) -> Float[Array, "h w 2"]:
@@ -126,6 +129,7 @@ class RectifyingPair(eqx.Module):
 
 
 @eqx.filter_jit
+@checked
 def rectifying_homographies(
     fundamental: Float[Array, "3 3"],
     first: Float[Array, "n 2"],

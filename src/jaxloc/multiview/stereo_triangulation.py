@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, gate, propagate_sampled, propagate_unscented
 from jaxloc.beliefs.square_root import cholesky
@@ -24,6 +25,7 @@ class TriangulationMethod(eqx.Module):
 class Linear(TriangulationMethod):
     """First-order propagation ``J R J^T``; accurate for sigma_d / d below about 0.1."""
 
+    @checked
     def triangulate(self, rig: StereoRig, measured: Gaussian, key: Key[Array, ""] | None) -> Gaussian:
         """Point and ``J R J^T``."""
         point = rig.triangulate(measured.mean[None])[0]
@@ -38,6 +40,7 @@ class Unscented(TriangulationMethod):
     beta: float = eqx.field(static=True, default=0.0)
     kappa: float | None = eqx.field(static=True, default=None)
 
+    @checked
     def triangulate(self, rig: StereoRig, measured: Gaussian, key: Key[Array, ""] | None) -> Gaussian:
         """Moments of the sigma points."""
         options = {"alpha": self.alpha, "beta": self.beta, "kappa": self.kappa}
@@ -49,6 +52,7 @@ class Sampled(TriangulationMethod):
 
     num_samples: int = eqx.field(static=True, default=256)
 
+    @checked
     def triangulate(self, rig: StereoRig, measured: Gaussian, key: Key[Array, ""] | None) -> Gaussian:
         """Moments of the samples."""
         if key is None:
@@ -60,6 +64,7 @@ _LINEAR = Linear()
 
 
 @eqx.filter_jit
+@checked
 def triangulate(
     rig: StereoRig,
     measurement: Float[Array, "3"],
@@ -100,6 +105,7 @@ def triangulate(
     return method.triangulate(rig, Gaussian(measurement, covariance), key)
 
 
+@checked
 def stereo_jacobian(rig: StereoRig, measurement: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Derivative of the point (x, y, z) by (u_left, u_right, v).
 
@@ -136,6 +142,7 @@ def stereo_jacobian(rig: StereoRig, measurement: Float[Array, "3"]) -> Float[Arr
 
 
 @eqx.filter_jit
+@checked
 def coverage(
     rig: StereoRig,
     point: Float[Array, "3"],

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.sensors import Pinhole
@@ -18,6 +19,7 @@ _UNSEEN = 1e3
 
 
 @eqx.filter_jit
+@checked
 def midpoint(
     centers: Float[Array, "n 3"], rays: Float[Array, "n 3"], *, valid: Bool[Array, " n"] | None = None
 ) -> Float[Array, "3"]:
@@ -55,6 +57,7 @@ def midpoint(
 
 
 @eqx.filter_jit
+@checked
 def correct_pair(
     first: Float[Array, "2"], second: Float[Array, "2"], matrix: Float[Array, "3 3"]
 ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
@@ -145,6 +148,7 @@ class TriangulationProblem(Problem):
 
 
 @eqx.filter_jit
+@checked
 def triangulate(
     camera: Pinhole,
     poses: SE3,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc._tree import detach_unless
 from jaxloc.multiview.epipolar import (
@@ -75,6 +76,7 @@ class _Pairs(NamedTuple):
 
 
 @eqx.filter_jit
+@checked
 def estimate_relative_pose(
     first: Float[Array, "n 2"],
     second: Float[Array, "n 2"],

@@ -71,6 +71,9 @@ def group_points(points: MovingPoints, *, options: GroupOptions = GroupOptions()
         Lenz, Ziegler, Geiger and Roser, "Sparse scene flow segmentation for moving object detection in urban
         environments", IV 2011; rigid bodies as points with a velocity [T-12], [B.7].
     """
+    if not points.valid.shape[0]:
+        # One empty slot in place of none.
+        points = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), points)
     count = min(options.most_points, points.valid.shape[0])
     order = lax.top_k(points.valid.astype(jnp.float32), count)[1]
     points = jax.tree.map(lambda leaf: leaf[order], points)
@@ -124,7 +127,9 @@ def _mean(
     member: Float[Array, "k n"], values: Float[Array, "n 3"], covariances: Float[Array, "n 3 3"]
 ) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
     """Means weighted by how well each depth is known, and their covariances."""
-    weights = member / jnp.trace(covariances, axis1=1, axis2=2)[None, :]
+    spread = jnp.trace(covariances, axis1=1, axis2=2)
+    # Empty slots may hold zeros.
+    weights = member / jnp.where(spread > 0.0, spread, 1.0)[None, :]
     total = jnp.sum(weights, axis=1, keepdims=True)
     weights = weights / jnp.where(total > 0.0, total, 1.0)
     covariance = jnp.einsum("kn,nij->kij", weights**2, covariances, precision="highest")

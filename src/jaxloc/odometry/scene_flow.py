@@ -4,6 +4,8 @@ What the motion of the camera explains is taken out first; only the rest is matc
 that is wide enough for oncoming cars, so that the cost is that of what moves and not of what stands.
 """
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -149,6 +151,11 @@ def _unexplained(
     rig: StereoRig, features: StereoFeatures, matched: Float[Array, "m 3"], inliers: Bool[Array, " m"], options
 ) -> _Points:
     """Features with depth that no match of the camera's motion is near to, with their patches."""
+    if not features.has_depth.shape[0]:
+        # One empty slot in place of none.
+        parts = (features.measured, features.variance, features.has_depth)
+        slots = tuple(jnp.zeros((1, *part.shape[1:]), part.dtype) for part in parts)
+        features = eqx.tree_at(lambda f: (f.measured, f.variance, f.has_depth), features, slots)
     apart = features.measured[:, None, :] - matched[None, :, :]
     beside = jnp.max(jnp.abs(apart), axis=-1) < options.beside
     explained = jnp.any(beside & inliers[None, :], axis=1)
@@ -160,7 +167,7 @@ def _unexplained(
     measured, variance, valid = safe[order], features.variance[order], wanted[order]
     uv = measured[:, jnp.array([0, 2])]
     patches = extract(features.left, uv, size=options.patch)
-    values = patches.values.reshape(count, -1)
+    values = patches.values.reshape(count, math.prod(patches.values.shape[1:]))
     values = values - jnp.mean(values, axis=1, keepdims=True)
     norm = jnp.sqrt(jnp.sum(values**2, axis=1, keepdims=True))
     values = values / jnp.maximum(norm, 1e-3)

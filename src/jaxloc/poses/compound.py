@@ -12,6 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses.se2 import SE2
 
@@ -21,6 +22,7 @@ def _rows(*rows: tuple[Array, ...]) -> Array:
 
 
 @eqx.filter_jit
+@checked
 def left_jacobian(a: SE2, b: SE2) -> Float[Array, "3 3"]:
     """Derivative of the compound's (x, y, theta) with respect to those of its left factor.
 
@@ -43,6 +45,7 @@ def left_jacobian(a: SE2, b: SE2) -> Float[Array, "3 3"]:
 
 
 @eqx.filter_jit
+@checked
 def right_jacobian(a: SE2, b: SE2) -> Float[Array, "3 3"]:
     """Derivative of the compound's (x, y, theta) with respect to those of its right factor.
 
@@ -66,6 +69,7 @@ def right_jacobian(a: SE2, b: SE2) -> Float[Array, "3 3"]:
 
 
 @eqx.filter_jit
+@checked
 def inverse_jacobian(a: SE2) -> Float[Array, "3 3"]:
     """Derivative of the inverse pose's (x, y, theta) with respect to those of the pose.
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import series
 from jaxloc.poses.lie_group import as_floats
@@ -69,6 +70,7 @@ class Direction(eqx.Module):
         first = jnp.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
         return jnp.stack([first, jnp.stack([b, sign + y * y * a, -y])], axis=1)
 
+    @checked
     def retract(self, delta: Float[Array, "2"]) -> "Direction":
         """The direction turned along a great circle by ``|delta|`` rad."""
         squared = jnp.sum(delta * delta)
@@ -77,6 +79,7 @@ class Direction(eqx.Module):
         # One Newton step keeps the length at one over any number of retractions.
         return Direction(turned * (1.5 - 0.5 * jnp.sum(turned * turned)))
 
+    @checked
     def local(self, other: "Direction") -> Float[Array, "2"]:
         """The tangent from this direction to the other; for the opposite one, half a turn along the first tangent."""
         side, along = matmul(self.basis().T, other.vector), jnp.sum(self.vector * other.vector)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc.poses.direction import Direction
 from jaxloc.poses.lie_group import Group
 
@@ -73,6 +74,7 @@ def _over_stack(function: Any, depth: int) -> Any:
     return function
 
 
+@checked
 def retract(value: Any, delta: Float[Array, " d"]) -> Any:
     """The value moved along a tangent: ``T @ exp(d)`` for poses (also stacked ones), a sum for arrays.
 
@@ -148,6 +150,7 @@ def is_flat(value: Any) -> bool:
     return not any(_is_manifold(node) for node in _leaves(value))
 
 
+@checked
 def carry(value: Any, delta: Float[Array, " d"], target: Any) -> Float[Array, "d d"]:
     """Derivative of ``local(target, retract(value, delta + e))`` by e: transports tangents and covariances.
 

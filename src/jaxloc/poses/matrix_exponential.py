@@ -4,12 +4,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxloc import _linalg
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 
 _HALVINGS, _TERMS = 4, 9
 _ROOTS, _ROOT_STEPS, _ODD_TERMS = 3, 7, 7
 
 
+@checked
 def exponential_less_identity(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
     """``exp(A) - I``, exact to rounding for norms up to about 6.
 
@@ -36,6 +38,7 @@ def exponential_less_identity(matrix: Float[Array, "k k"]) -> Float[Array, "k k"
     return result
 
 
+@checked
 def logarithm(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
     """The principal logarithm of a matrix without eigenvalues on the negative real axis.
 

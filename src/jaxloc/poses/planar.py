@@ -3,7 +3,10 @@
 import numpy as np
 from jaxtyping import Float64
 
+from jaxloc._arguments import checked
 
+
+@checked
 def relative_poses(before: Float64[np.ndarray, "n 3"], after: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
     """Relative poses (x, y, heading): ``T_a^-1 T_b``, headings in [-pi, pi).
 
@@ -24,6 +27,7 @@ def relative_poses(before: Float64[np.ndarray, "n 3"], after: Float64[np.ndarray
     return np.stack([cos * shift[:, 0] + sin * shift[:, 1], cos * shift[:, 1] - sin * shift[:, 0], turn], axis=1)
 
 
+@checked
 def compose_poses(first: Float64[np.ndarray, "n 3"], then: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
     """Compositions ``T_a T_b`` of poses and motions, the inverse of `relative_poses`.
 
@@ -44,6 +48,7 @@ def compose_poses(first: Float64[np.ndarray, "n 3"], then: Float64[np.ndarray, "
     return np.stack([x, y, first[:, 2] + then[:, 2]], axis=1)
 
 
+@checked
 def dead_reckon(
     times: Float64[np.ndarray, " n"], twists: Float64[np.ndarray, "n 2"], at: Float64[np.ndarray, " t"]
 ) -> Float64[np.ndarray, "t 3"]:
@@ -74,6 +79,7 @@ def _arc(headings: np.ndarray, twists: np.ndarray, seconds: np.ndarray) -> np.nd
     return np.stack([chord * np.cos(middle), chord * np.sin(middle)], axis=1)
 
 
+@checked
 def interpolate_poses(
     times: Float64[np.ndarray, " n"], poses: Float64[np.ndarray, "n 3"], at: Float64[np.ndarray, " t"]
 ) -> Float64[np.ndarray, "t 3"]:
@@ -82,6 +88,7 @@ def interpolate_poses(
     return np.stack([np.interp(at, times, column) for column in (*poses[:, :2].T, headings)], axis=1)
 
 
+@checked
 def planar_matrix(pose: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
     """The spatial pose of a planar one, at height zero.
 

@@ -5,9 +5,10 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import series
-from jaxloc.poses.lie_group import Group, as_floats
+from jaxloc.poses.lie_group import Group, as_floats, bounded, largest_angle, largest_length, unless
 from jaxloc.poses.so2 import SO2
 
 
@@ -33,6 +34,7 @@ class SE2(Group):
         self.translation = jnp.stack([x, y])
 
     @staticmethod
+    @checked
     def from_parts(rotation: SO2, translation: Float[Array, "2"]) -> "SE2":
         """Pose of a rotation and a translation, without an angle in between."""
         pose = object.__new__(SE2)
@@ -41,6 +43,7 @@ class SE2(Group):
         return pose
 
     @staticmethod
+    @checked
     def from_matrix(matrix: Float[Array, "3 3"]) -> "SE2":
         """Pose of a homogeneous matrix."""
         return SE2.from_parts(SO2(matrix[0, 0], matrix[1, 0]), matrix[:2, 2])
@@ -51,15 +54,17 @@ class SE2(Group):
         return SE2.from_parts(SO2.identity(dtype), jnp.zeros(2, dtype))
 
     @staticmethod
+    @checked
     def exp(xi: Float[Array, "3"]) -> "SE2":
         """Exponential map: the pose reached by the constant twist (v_x, v_y, omega) in unit time."""
-        theta = xi[2]
+        finite, (v, theta) = bounded((xi[:2], largest_length(xi.dtype)), (xi[2], largest_angle(xi.dtype)))
         s = theta * theta
         a, b = series.sinc(s), theta * series.versine(s)
-        translation = jnp.stack([a * xi[0] - b * xi[1], b * xi[0] + a * xi[1]])
-        return SE2.from_parts(SO2.from_angle(theta), translation)
+        translation = jnp.stack([a * v[0] - b * v[1], b * v[0] + a * v[1]])
+        return unless(finite, SE2.from_parts(SO2.from_angle(theta), translation))
 
     @staticmethod
+    @checked
     def left_jacobian(xi: Float[Array, "3"]) -> Float[Array, "3 3"]:
         """``J`` with ``exp(xi + d) ~ exp(J d) @ exp(xi)``; the right one is ``left_jacobian(-xi)``."""
         theta = xi[2]
@@ -74,6 +79,7 @@ class SE2(Group):
         return jnp.stack([jnp.stack(row) for row in rows])
 
     @staticmethod
+    @checked
     def left_jacobian_inverse(xi: Float[Array, "3"]) -> Float[Array, "3 3"]:
         """Inverse of `left_jacobian`, for angles below 2 pi."""
         jacobian = SE2.left_jacobian(xi)
@@ -103,15 +109,19 @@ class SE2(Group):
 
     def log(self) -> Float[Array, "3"]:
         """Logarithm: the twist that reaches this pose in unit time."""
-        theta = self.theta
-        linear = matmul(_inverse_mean_rotation(theta), self.translation)
-        return jnp.concatenate([linear, theta[None]])
+        cos, sin, room = self.rotation.cos, self.rotation.sin, largest_length(self.translation.dtype)
+        finite, (cos, sin, translation) = bounded((cos, 4.0), (sin, 4.0), (self.translation, room))
+        theta = SO2(cos, sin).angle()
+        linear = matmul(_inverse_mean_rotation(theta), translation)
+        return unless(finite, jnp.concatenate([linear, theta[None]]))
 
+    @checked
     def compose(self, other: "SE2") -> "SE2":
         """``T_a_b @ T_b_c = T_a_c``."""
         rotated = matmul(self.rotation.matrix(), other.translation)
         return SE2.from_parts(self.rotation.compose(other.rotation), self.translation + rotated)
 
+    @checked
     def retract(self, delta: Float[Array, "3"]) -> "SE2":
         """``T @ exp(delta)``."""
         return self.compose(SE2.exp(delta))
@@ -132,6 +142,7 @@ class SE2(Group):
         top = jnp.concatenate([self.rotation.matrix(), column], axis=1)
         return jnp.concatenate([top, jnp.array([[0, 0, 1]], top.dtype)])
 
+    @checked
     def apply(self, points: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
         """Points of the inner frame in the outer frame."""
         return self.rotation.apply(points) + self.translation[None, :]

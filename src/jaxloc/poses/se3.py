@@ -5,9 +5,10 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import series
-from jaxloc.poses.lie_group import Group, as_floats, skew
+from jaxloc.poses.lie_group import Group, as_floats, bounded, largest_angle, largest_length, skew, unless
 from jaxloc.poses.so3 import SO3
 
 
@@ -35,6 +36,7 @@ class SE3(Group):
         return SE3(SO3.identity(dtype), jnp.zeros(3, dtype))
 
     @staticmethod
+    @checked
     def from_matrix(matrix: Float[Array, "4 4"]) -> "SE3":
         """Pose of a homogeneous matrix (its rotation is not orthonormalized; see `normalize`)."""
         return SE3(SO3(matrix[:3, :3]), matrix[:3, 3])
@@ -46,18 +48,21 @@ class SE3(Group):
         return SE3(SO3.from_euler(yaw, pitch, roll), translation)
 
     @staticmethod
+    @checked
     def exp(xi: Float[Array, "6"]) -> "SE3":
         """Exponential map: the pose reached by the constant twist (v, omega) in unit time."""
-        v, omega = xi[:3], xi[3:]
-        return SE3(SO3.exp(omega), matmul(SO3.left_jacobian(omega), v))
+        finite, (v, omega) = bounded((xi[:3], largest_length(xi.dtype)), (xi[3:], largest_angle(xi.dtype)))
+        return unless(finite, SE3(SO3.exp(omega), matmul(SO3.left_jacobian(omega), v)))
 
     @staticmethod
+    @checked
     def left_jacobian(xi: Float[Array, "6"]) -> Float[Array, "6 6"]:
         """``J`` with ``exp(xi + d) ~ exp(J d) @ exp(xi)``; the right one is ``left_jacobian(-xi)``."""
         rotation = SO3.left_jacobian(xi[3:])
         return _block_triangular(rotation, _translation_coupling(xi))
 
     @staticmethod
+    @checked
     def left_jacobian_inverse(xi: Float[Array, "6"]) -> Float[Array, "6 6"]:
         """Inverse of `left_jacobian`, for angles below 2 pi."""
         rotation = SO3.left_jacobian_inverse(xi[3:])
@@ -70,14 +75,18 @@ class SE3(Group):
 
     def log(self) -> Float[Array, "6"]:
         """Logarithm: the twist that reaches this pose in unit time."""
-        omega = self.rotation.log()
-        return jnp.concatenate([matmul(SO3.left_jacobian_inverse(omega), self.translation), omega])
+        room = largest_length(self.translation.dtype)
+        finite, (matrix, translation) = bounded((self.rotation.rotation_matrix, 4.0), (self.translation, room))
+        omega = SO3(matrix).log()
+        return unless(finite, jnp.concatenate([matmul(SO3.left_jacobian_inverse(omega), translation), omega]))
 
+    @checked
     def compose(self, other: "SE3") -> "SE3":
         """``T_a_b @ T_b_c = T_a_c``."""
         rotated = matmul(self.rotation.rotation_matrix, other.translation)
         return SE3(self.rotation.compose(other.rotation), self.translation + rotated)
 
+    @checked
     def retract(self, delta: Float[Array, "6"]) -> "SE3":
         """``T @ exp(delta)``."""
         return self.compose(SE3.exp(delta))
@@ -97,6 +106,7 @@ class SE3(Group):
         rotation = self.rotation.rotation_matrix
         return _block_triangular(rotation, matmul(skew(self.translation), rotation))
 
+    @checked
     def apply(self, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Points of the inner frame in the outer frame."""
         return self.rotation.apply(points) + self.translation[None, :]

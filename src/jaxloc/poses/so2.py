@@ -3,8 +3,10 @@
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses.lie_group import Group, as_floats
 
@@ -36,7 +38,9 @@ class SO2(Group):
     def from_angle(angle: Any) -> "SO2":
         """Rotation by an angle, rad, counter-clockwise."""
         (angle,) = as_floats(angle)
-        return SO2(jnp.cos(angle), jnp.sin(angle))
+        finite = jnp.isfinite(angle)
+        safe = jnp.where(finite, angle, 0.0)
+        return SO2(jnp.where(finite, jnp.cos(safe), jnp.nan), jnp.where(finite, jnp.sin(safe), jnp.nan))
 
     @staticmethod
     def identity(dtype: Any = float) -> "SO2":
@@ -44,11 +48,13 @@ class SO2(Group):
         return SO2(jnp.ones((), dtype), jnp.zeros((), dtype))
 
     @staticmethod
+    @checked
     def exp(xi: Float[Array, "1"]) -> "SO2":
         """Rotation of a tangent (rad)."""
         return SO2.from_angle(xi[0])
 
     @staticmethod
+    @checked
     def left_jacobian(xi: Float[Array, "1"]) -> Float[Array, "1 1"]:
         """One, since planar rotations commute."""
         return jnp.ones((1, 1), xi.dtype)
@@ -60,16 +66,22 @@ class SO2(Group):
 
     def angle(self) -> Float[Array, ""]:
         """Angle in (-pi, pi]."""
-        return jnp.arctan2(self.sin, self.cos)
+        finite, small = (test(self.sin) & test(self.cos) for test in (jnp.isfinite, lambda x: jnp.abs(x) <= 4.0))
+        # The squares in its derivative overflow for larger numbers, which are no cosines.
+        sin, cos = jnp.where(small, self.sin, 0.0), jnp.where(small, self.cos, 1.0)
+        other = lax.stop_gradient(jnp.arctan2(self.sin, self.cos))
+        return jnp.where(small, jnp.arctan2(sin, cos), jnp.where(finite, other, jnp.nan))
 
     def log(self) -> Float[Array, "1"]:
         """Angle as a tangent."""
         return self.angle()[None]
 
+    @checked
     def compose(self, other: "SO2") -> "SO2":
         """The product: rotation by the sum of both angles."""
         return SO2(self.cos * other.cos - self.sin * other.sin, self.sin * other.cos + self.cos * other.sin)
 
+    @checked
     def retract(self, delta: Float[Array, "1"]) -> "SO2":
         """The rotation perturbed by an angle delta."""
         return self.compose(SO2.exp(delta))
@@ -86,6 +98,7 @@ class SO2(Group):
         """One, since planar rotations commute."""
         return jnp.ones((1, 1), self.cos.dtype)
 
+    @checked
     def apply(self, points: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
         """Rotated points."""
         return matmul(points, self.matrix().T)
@@ -96,6 +109,8 @@ class SO2(Group):
         return SO2(self.cos * scale, self.sin * scale)
 
 
+@checked
 def wrap_angle(angle: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Angles wrapped to [-pi, pi), rad; the derivative is one."""
-    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+    """Angles wrapped to [-pi, pi), rad; the derivative is one. NaN for those that are not finite, derivative zero."""
+    finite = jnp.isfinite(angle)
+    return jnp.where(finite, (jnp.where(finite, angle, 0.0) + jnp.pi) % (2 * jnp.pi) - jnp.pi, jnp.nan)

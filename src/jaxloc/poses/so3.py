@@ -5,9 +5,10 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import series
-from jaxloc.poses.lie_group import Group, as_floats, skew
+from jaxloc.poses.lie_group import Group, as_floats, bounded, largest_angle, skew, unless
 
 
 class SO3(Group):
@@ -31,11 +32,13 @@ class SO3(Group):
         return SO3(jnp.eye(3, dtype=dtype))
 
     @staticmethod
+    @checked
     def from_matrix(matrix: Float[Array, "3 3"]) -> "SO3":
         """Rotation of an orthonormal matrix (not orthonormalized; see `normalize`)."""
         return SO3(matrix)
 
     @staticmethod
+    @checked
     def from_quaternion(wxyz: Float[Array, "4"]) -> "SO3":
         """Rotation of a quaternion (scalar first), which is normalized; zero gives the identity."""
         norm_squared = jnp.sum(wxyz**2)
@@ -59,14 +62,17 @@ class SO3(Group):
         return SO3(jnp.stack([jnp.stack(row) for row in rows]))
 
     @staticmethod
+    @checked
     def exp(xi: Float[Array, "3"]) -> "SO3":
         """Rotation about ``xi`` by its length (Rodrigues), rad."""
+        finite, (xi,) = bounded((xi, largest_angle(xi.dtype)))
         s = jnp.sum(xi**2)
         cross = skew(xi)
         eye = jnp.eye(3, dtype=xi.dtype)
-        return SO3(eye + series.sinc(s) * cross + series.versine(s) * matmul(cross, cross))
+        return unless(finite, SO3(eye + series.sinc(s) * cross + series.versine(s) * matmul(cross, cross)))
 
     @staticmethod
+    @checked
     def left_jacobian(xi: Float[Array, "3"]) -> Float[Array, "3 3"]:
         """``J`` with ``exp(xi + d) ~ exp(J d) @ exp(xi)``; the right one is ``left_jacobian(-xi)``."""
         s = jnp.sum(xi**2)
@@ -74,6 +80,7 @@ class SO3(Group):
         return jnp.eye(3, dtype=xi.dtype) + series.versine(s) * cross + series.third(s) * matmul(cross, cross)
 
     @staticmethod
+    @checked
     def left_jacobian_inverse(xi: Float[Array, "3"]) -> Float[Array, "3 3"]:
         """Inverse of `left_jacobian`, for angles below 2 pi."""
         s = jnp.sum(xi**2)
@@ -106,7 +113,9 @@ class SO3(Group):
 
     def log(self) -> Float[Array, "3"]:
         """Rotation vector of length at most pi; finite with its derivatives at zero and at pi."""
-        q = self.quaternion()
+        # No entry of a rotation is above one.
+        finite, (matrix,) = bounded((self.rotation_matrix, 4.0))
+        q = SO3(matrix).quaternion()
         w, v = q[0], q[1:]
         n2 = jnp.sum(v**2)
         small = n2 < 1e-2
@@ -115,7 +124,7 @@ class SO3(Group):
         near = sum((-t2) ** k / (2 * k + 1) for k in range(9)) / jnp.where(small, w, 1.0)
         n = jnp.sqrt(jnp.where(small, 1.0, n2))
         far = jnp.arctan2(n, w) / n
-        return 2.0 * jnp.where(small, near, far) * v
+        return unless(finite, 2.0 * jnp.where(small, near, far) * v)
 
     def euler(self) -> Float[Array, "3"]:
         """(yaw, pitch, roll) of ``Rz Ry Rx``, rad; at pitch +-90 degrees yaw is 0 and roll takes all [K-7]."""
@@ -131,10 +140,12 @@ class SO3(Group):
         roll_cos = jnp.where(locked, m[1, 1], m[2, 2])
         return jnp.stack([yaw, pitch, jnp.arctan2(roll_sin, roll_cos)])
 
+    @checked
     def compose(self, other: "SO3") -> "SO3":
         """The product of both rotations."""
         return SO3(matmul(self.rotation_matrix, other.rotation_matrix))
 
+    @checked
     def retract(self, delta: Float[Array, "3"]) -> "SO3":
         """``R @ exp(delta)``."""
         return self.compose(SO3.exp(delta))
@@ -151,6 +162,7 @@ class SO3(Group):
         """The rotation matrix itself."""
         return self.rotation_matrix
 
+    @checked
     def apply(self, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Rotated points."""
         return matmul(points, self.rotation_matrix.T)

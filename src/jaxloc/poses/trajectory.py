@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxloc.poses.lie_group import Group
+from jaxloc import _tree as tree
+from jaxloc._arguments import checked
+from jaxloc.poses.lie_group import Group, bounded, largest_length, unless
 from jaxloc.poses.se3 import SE3
 
 
@@ -41,6 +43,7 @@ class Trajectory(eqx.Module):
             )
 
     @staticmethod
+    @checked
     def from_matrices(times: Float[Array, " n"], matrices: Float[Array, "n 4 4"]) -> "Trajectory":
         """Trajectory in space of homogeneous matrices."""
         return Trajectory(times, jax.vmap(SE3.from_matrix)(matrices))
@@ -69,6 +72,7 @@ class Trajectory(eqx.Module):
         """Length of the path, m."""
         return jnp.sum(jnp.linalg.norm(jnp.diff(self.positions, axis=0), axis=1))
 
+    @checked
     def at(self, time: Float[Array, ""]) -> Any:
         """The pose at a time, along the geodesic between its neighbors; clamped to the ends."""
         after = jnp.clip(jnp.searchsorted(self.times, time), 1, len(self) - 1)
@@ -97,6 +101,12 @@ def chain(initial: Any, motions: Any) -> Any:
     return jax.tree.map(lambda first, others: jnp.concatenate([first[None], others]), initial, rest)
 
 
+@checked
 def interpolate(a: Any, b: Any, fraction: Float[Array, ""]) -> Any:
-    """Geodesic interpolation between two poses, at a fraction from 0 to 1."""
-    return a.retract(fraction * a.local(b))
+    """Geodesic interpolation between two poses, at a fraction from 0 to 1; NaN where one of them is not finite."""
+    leaves, structure = jax.tree.flatten((a, b, fraction))
+    # Their difference is finite too.
+    finite, leaves = bounded(*((leaf, largest_length(leaf.dtype)) for leaf in leaves))
+    first, second, part = jax.tree.unflatten(structure, leaves)
+    safe = tree.where(finite, (first, second), (a.identity(leaves[0].dtype),) * 2)
+    return unless(finite, safe[0].retract(part * safe[0].local(safe[1])))

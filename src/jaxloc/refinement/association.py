@@ -238,6 +238,8 @@ def associate(
     costs = pair_costs(pose, observed, known, sources=sources, sigma=sigma)
     best = assign(costs.values, costs.feasible)
     columns = best.columns
+    if not costs.feasible.size:
+        return Association(columns, costs, best.cost)
     if sources.separation is not None:
         columns = _unambiguous(columns, costs, sources.separation)
     if sources.conditioning is not None:
@@ -264,6 +266,8 @@ def _support_cost(
     consensus: PairConsensus, observed: Array, known: Array, feasible: Bool[Array, "n m"], sigma: Any
 ) -> Float[Array, "n m"]:
     """Cost of a pair (i, j): the part of the other features k that have no l with ``|x_i - x_k| = |y_j - y_l|``."""
+    if not feasible.size:
+        return jnp.zeros(feasible.shape, observed.dtype)
     deviation = jnp.asarray(2.0 * sigma if consensus.sigma is None else consensus.sigma, observed.dtype)
     inside, outside = (_distances(points) for points in (observed, known))
     feasible_rows = jnp.any(feasible, axis=1)

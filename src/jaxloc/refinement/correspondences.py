@@ -26,6 +26,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc.poses import SE2, SE3
 from jaxloc.refinement.feature_pairs import (
     LineLine,
@@ -104,6 +105,7 @@ class Mixed(Problem):
 
 
 @eqx.filter_jit
+@checked
 def refine(
     correspondences: Correspondences,
     initial: SE2 | SE3,

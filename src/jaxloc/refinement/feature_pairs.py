@@ -10,6 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE2, SE3
 from jaxloc.solvers import Linearization
@@ -184,6 +185,7 @@ class LineLine(Pairs):
 
 
 @eqx.filter_jit
+@checked
 def nearest_on_segment(
     points: Float[Array, "n k"], first: Float[Array, "n k"], second: Float[Array, "n k"]
 ) -> Float[Array, "n k"]:

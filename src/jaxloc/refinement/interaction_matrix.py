@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import Direction
 from jaxloc.solvers import Linearization, Problem, Quadratic
@@ -157,6 +158,7 @@ class DirectionalFlow(Problem):
         left = self.flow - jnp.tensordot(rotation, angular, 1, precision="highest")
         return jnp.sum(along * left, axis=0), jnp.sum(normal * left, axis=0)
 
+    @checked
     def rotation_for(self, direction: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
         """The best rotation for a direction of translation, by linear least squares, and its cost."""
         linear, angular = flow_parts(self.points)
@@ -168,6 +170,7 @@ class DirectionalFlow(Problem):
 
 
 @eqx.filter_jit
+@checked
 def interaction_matrix(points: Float[Array, "n 2"], depth: Float[Array, " n"]) -> Float[Array, "n 2 6"]:
     """Interaction matrix: flow of image points by the twist of the camera, ``flow_k = L_k (v, w)``.
 
@@ -192,6 +195,7 @@ def interaction_matrix(points: Float[Array, "n 2"], depth: Float[Array, " n"]) -
     return jnp.transpose(jnp.concatenate([linear * inverse[None, None, :], angular]), (2, 1, 0))
 
 
+@checked
 def flow_parts(points: Float[Array, "2 n"]) -> tuple[Float[Array, "3 2 n"], Float[Array, "3 2 n"]]:
     """Derivatives of the flow by translation at unit depth, and by rotation: direction first."""
     x, y = points

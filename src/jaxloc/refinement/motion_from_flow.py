@@ -26,6 +26,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import Direction
 from jaxloc.refinement.interaction_matrix import (
@@ -57,6 +58,7 @@ _DIRECTIONS = 96  # initial values on a half-sphere, 15 degrees apart
 
 
 @eqx.filter_jit
+@checked
 def twist_from_flow(
     points: Float[Array, "n 2"],
     flow: Float[Array, "n 2"],
@@ -101,6 +103,7 @@ def twist_from_flow(
 
 
 @eqx.filter_jit
+@checked
 def rotation_from_flow(
     points: Float[Array, "n 2"],
     flow: Float[Array, "n 2"],
@@ -138,6 +141,7 @@ def rotation_from_flow(
 
 
 @eqx.filter_jit
+@checked
 def motion_from_flow(
     points: Float[Array, "n 2"],
     flow: Float[Array, "n 2"],

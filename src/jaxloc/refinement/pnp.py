@@ -4,15 +4,21 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _tree as tree
+from jaxloc._arguments import checked
+from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
+from jaxloc.poses.lie_group import skew
 from jaxloc.refinement.reprojection import Reprojection
 from jaxloc.sensors import Pinhole
-from jaxloc.solvers import Estimate, GaussNewton, Quadratic, Solver, solve
+from jaxloc.solvers import Estimate, GaussNewton, Quadratic, Solver, Status, solve
 
 
 @eqx.filter_jit
+@checked
 def refine_pose(
     camera: Pinhole,
     points_world: Float[Array, "n 3"],
@@ -40,7 +46,8 @@ def refine_pose(
 
     Returns:
         Estimate of ``T_world_camera`` with covariance in its tangent (right perturbation: camera axes). ``ok`` is False
-        when fewer than three independent points are visible, when under plain least squares a point lies behind the
+        when fewer than three independent points are visible, when a standard deviation exceeds a radian or the distance
+        (as of points on a line), when under plain least squares a point lies behind the
         camera, or when the solver did not converge.
 
     References:
@@ -57,8 +64,54 @@ def refine_pose(
     """
     usable, points, pixels = _usable(valid, points_world, pixels)
     sigma = jnp.asarray(sigma, pixels.dtype)
-    problem = Reprojection(camera, points.T, pixels.T, sigma, usable, loss)
-    return solve(problem, initial, solver=solver)
+    mean = _mean(points, usable)
+    center = _seen_from(initial, mean)
+    problem = Reprojection(camera, points.T, pixels.T, sigma, usable, loss, center)
+    fit = solve(problem, _shifted(initial, center), solver=solver)
+    return _refuse_vague(_about_camera(fit, center), fit.covariance, mean)
+
+
+def _mean(points: Float[Array, "n 3"], usable: Bool[Array, " n"]) -> Float[Array, "3"]:
+    """Mean of the usable points (the others are zero), without derivatives."""
+    count = jnp.maximum(jnp.sum(usable), 1).astype(points.dtype)
+    return lax.stop_gradient(jnp.sum(points, axis=0) / count)
+
+
+def _seen_from(pose: SE3, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """A point in the frame of a pose, without derivatives; zero where it is not finite."""
+    seen = lax.stop_gradient(pose.inverse().apply(point[None])[0])
+    return jnp.where(jnp.all(jnp.isfinite(seen)), seen, 0.0)
+
+
+def _shifted(pose: SE3, offset: Float[Array, "3"]) -> SE3:
+    """The pose of a frame of the same axes at a point of the given one."""
+    return SE3(pose.rotation, pose.apply(offset[None])[0])
+
+
+def _refuse_vague(fit: Estimate, covariance: Float[Array, "6 6"], mean: Float[Array, "3"]) -> Estimate:
+    """Refuses an estimate of whose direction or distance nothing is known: of points on a line, for instance.
+
+    Its rank depends on rounding, and so on the precision; standard deviations do not. Beyond a radian, or the distance
+    of the points, the linearization means nothing. The covariance is that of the frame at the center.
+    """
+    variance, distance = lax.stop_gradient(jnp.diagonal(covariance)), _seen_from(fit.value, mean)
+    vague = (jnp.sum(variance[3:]) > 1.0) | (jnp.sum(variance[:3]) > jnp.sum(distance * distance))
+    ok = fit.ok & ~vague
+    status = jnp.where(fit.ok & vague, int(Status.RANK_DEFICIENT), fit.status)
+    found = fit.value, fit.covariance, fit.cost, fit.information
+    value, covariance, cost, information = tree.detach_unless(ok, found)
+    return Estimate(value, covariance, cost, ok, fit.num_steps, status, information)
+
+
+def _about_camera(fit: Estimate, center: Float[Array, "3"]) -> Estimate:
+    """The estimate of the camera's pose from that of the frame at the center."""
+    eye, zero = jnp.eye(3, dtype=center.dtype), jnp.zeros((3, 3), center.dtype)
+    turned = jnp.block([[eye, skew(center)], [zero, eye]])
+    back = jnp.block([[eye, -skew(center)], [zero, eye]])
+    covariance = matmul(turned, matmul(fit.covariance, turned.T))
+    information = matmul(back.T, matmul(fit.information, back))
+    value = _shifted(fit.value, -center)
+    return Estimate(value, covariance, fit.cost, fit.ok, fit.num_steps, fit.status, information)
 
 
 def _usable(valid: Any, first: Array, second: Array) -> tuple[Bool[Array, " n"], Array, Array]:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.sensors import Pinhole, StereoRig
@@ -23,6 +24,10 @@ _HIDDEN = 1e3
 class Reprojection(Problem):
     """Least-squares problem of pixels of known points in one camera; the state is its pose ``T_world_camera``.
 
+    With a center, the state is the pose of a frame with the camera's axes at this point instead. It turns about the
+    points then, and not about the far camera: turning and moving sideways no longer look nearly the same, which single
+    precision could not tell apart.
+
     Attributes:
         camera: the camera.
         points: "3 n", world frame, m; finite everywhere.
@@ -30,6 +35,7 @@ class Reprojection(Problem):
         sigma: standard deviation of a pixel coordinate, px.
         valid: items that are used.
         loss: robust kernel over the two components of an item.
+        center: point of the camera frame, m, at which the frame of the state lies; None for the camera itself.
     """
 
     camera: Pinhole
@@ -38,35 +44,42 @@ class Reprojection(Problem):
     sigma: Float[Array, ""]
     valid: Bool[Array, " n"]
     loss: Any = Quadratic()
+    center: Float[Array, "3"] | None = None
 
     def residual(self, state: SE3) -> Float[Array, "2 n"]:
         """Whitened pixel errors, zero for masked items [K-56]."""
-        c, visible = _camera_points(self.camera, state, self.points, self.valid)
+        c, visible = _camera_points(self.camera, state, self.points, self.valid, self.center)
         predicted = jnp.stack(self.camera.project_components(*c))
         return _mask(predicted - self.pixels, visible, self.valid, 1.0 / self.sigma)
 
     def linearize(self, state: SE3) -> Linearization:
         """Residual and its Jacobian in closed form."""
-        c, visible = _camera_points(self.camera, state, self.points, self.valid)
+        c, visible = _camera_points(self.camera, state, self.points, self.valid, self.center)
         predicted = jnp.stack(self.camera.project_components(*c))
         # Weight and mask are applied to the smallest arrays.
         weight = jnp.where(visible, 1.0 / self.sigma, 0.0)
-        jacobian = _pose_jacobian(_pixel_jacobian(self.camera, c, weight), c)
+        jacobian = _pose_jacobian(_pixel_jacobian(self.camera, c, weight), self._levers(c))
         return Linearization(_mask(predicted - self.pixels, visible, self.valid, 1.0 / self.sigma), jacobian)
 
     def admissible(self, state: SE3) -> Bool[Array, ""]:
         """Whether three points are in front of the camera and, under plain least squares, all valid points."""
-        return _enough_visible(self.camera, state, self.points, self.valid, self.loss)
+        return _enough_visible(self.camera, state, self.points, self.valid, self.loss, self.center)
 
     def hessian(self, state: SE3) -> Float[Array, "6 6"]:
         """Exact Hessian at a minimum."""
-        c, visible = _camera_points(self.camera, state, self.points, self.valid)
+        c, visible = _camera_points(self.camera, state, self.points, self.valid, self.center)
 
         def item_cost(*c: Array) -> Array:
             error = (jnp.stack(self.camera.project_components(*c)) - self.pixels) / self.sigma
             return jnp.where(visible, self.loss.rho(jnp.sum(error**2, axis=0)), 0.0)
 
-        return _rigid_hessian(item_cost, c)
+        return _rigid_hessian(item_cost, c, self._levers(c))
+
+    def _levers(self, c: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        """The points in the frame of the state, about whose origin it turns."""
+        if self.center is None:
+            return c
+        return c[0] - self.center[0], c[1] - self.center[1], c[2] - self.center[2]
 
 
 class StereoReprojection(Problem):
@@ -120,22 +133,25 @@ class StereoReprojection(Problem):
 
 
 def _camera_points(
-    camera: Pinhole, pose: SE3, points: Float[Array, "3 n"], valid: Bool[Array, " n"]
+    camera: Pinhole, pose: SE3, points: Float[Array, "3 n"], valid: Bool[Array, " n"], center: Array | None = None
 ) -> tuple[Any, Any]:
     """Component arrays of the points in the camera frame, with finite values where invisible, and the visible mask."""
     rotation = pose.rotation.matrix()
     moved = matmul(rotation.T, points - pose.translation[:, None])
+    moved = moved if center is None else moved + center[:, None]
     visible = valid & camera.in_front_components(moved[0], moved[1], moved[2])
     x, y, z = jnp.where(visible, moved[0], 0.0), jnp.where(visible, moved[1], 0.0), jnp.where(visible, moved[2], 1.0)
     return (x, y, z), visible
 
 
-def _enough_visible(camera: Pinhole, pose: SE3, points: Array, valid: Array, loss: Any) -> Bool[Array, ""]:
+def _enough_visible(
+    camera: Pinhole, pose: SE3, points: Array, valid: Array, loss: Any, center: Array | None = None
+) -> Bool[Array, ""]:
     """At least three points, since rounding can hide that two are degenerate.
 
     Robust kernels treat a point behind the camera as an outlier; otherwise the pose or the data are wrong.
     """
-    _, visible = _camera_points(camera, pose, points, valid)
+    _, visible = _camera_points(camera, pose, points, valid, center)
     enough = jnp.sum(visible) >= 3
     return enough & jnp.all(visible == valid) if is_quadratic(loss) else enough
 
@@ -165,6 +181,7 @@ def _pixel_jacobian(camera: Pinhole, c: tuple[Array, Array, Array], weight: Any 
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
+@checked
 def stereo_jacobian(rig: StereoRig, c: tuple[Array, Array, Array]) -> Float[Array, "3 3 n"]:
     """Derivative of (u_left, u_right, v) with respect to the point: direction first, then component."""
     pixel = _pixel_jacobian(rig.camera, c)
@@ -181,7 +198,9 @@ def _pose_jacobian(point_jacobian: Float[Array, "3 k n"], c: tuple[Array, Array,
     return jnp.stack([-jx, -jy, -jz, jy * z - jz * y, jz * x - jx * z, jx * y - jy * x])
 
 
-def _rigid_hessian(item_cost: Any, c: tuple[Array, Array, Array]) -> Float[Array, "6 6"]:
+def _rigid_hessian(
+    item_cost: Any, c: tuple[Array, Array, Array], levers: tuple[Array, Array, Array] | None = None
+) -> Float[Array, "6 6"]:
     """Hessian, along the tangent of a pose, of a sum of costs of points in the frame of the camera, at a minimum.
 
     The chain rule to second order: the Hessian A of a cost in its point gives ``D^T A D`` with the derivative D of the
@@ -196,11 +215,12 @@ def _rigid_hessian(item_cost: Any, c: tuple[Array, Array, Array]) -> Float[Array
     axes = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
     curvature = jnp.stack([jnp.stack(jax.jvp(slope, c, axis)[1]) for axis in axes])
     eye = jnp.stack([jnp.stack(axis) for axis in axes])
-    moves = _pose_jacobian(eye, c)
-    bent = _pose_jacobian(curvature, c)
+    levers = c if levers is None else levers
+    moves = _pose_jacobian(eye, levers)
+    bent = _pose_jacobian(curvature, levers)
     size = moves.shape[0]
     product = matmul(moves.reshape(size, -1), bent.reshape(size, -1).T)
-    lever = matmul(jnp.stack(slope(*c)), jnp.stack(c).T)
+    lever = matmul(jnp.stack(slope(*c)), jnp.stack(levers).T)
     turning = 0.5 * (lever + lever.T) - jnp.trace(lever) * jnp.eye(3, dtype=lever.dtype)
     return product.at[3:, 3:].add(turning)
 
@@ -216,6 +236,7 @@ def _lower_product(lower: Float[Array, "3 3 n"], vector: Float[Array, "3 n"]) ->
 
 
 @eqx.filter_jit
+@checked
 def whitener(covariances: Float[Array, "n 3 3"]) -> Float[Array, "3 3 n"]:
     """Inverse Cholesky factors of many 3x3 covariances, unrolled, points along the last axis.
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.multiview import stereo_triangulation
 from jaxloc.poses import SE3
@@ -17,6 +18,7 @@ from jaxloc.solvers import Estimate, Quadratic, solve
 
 
 @eqx.filter_jit
+@checked
 def refine_motion(
     rig: StereoRig,
     previous: Float[Array, "n 3"],
@@ -100,6 +102,7 @@ class StereoMatches(eqx.Module):
         return StereoMatches(previous, current, noise(covariance_previous), noise(covariance_current), usable)
 
 
+@checked
 def motion_problem(rig: StereoRig, matches: StereoMatches, pose: SE3, loss: Any) -> StereoReprojection:
     """Least-squares problem of the motion, linearized in the previous measurements at a pose near the solution.
 

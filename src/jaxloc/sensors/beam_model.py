@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.scipy.stats import norm
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc.beliefs.models import Sensor
 from jaxloc.poses import SE2
 from jaxloc.sensors.laser_scan import SHORTEST, LaserScan, discount, scan_like
@@ -81,16 +82,19 @@ class BeamModel(Sensor):
         self.independent_beams = arrays[-1]
         self.num_steps = num_steps
 
+    @checked
     def expect(self, state: SE2, measurement: LaserScan) -> LaserScan:
         """Ranges to the obstacles of the map; the largest range where there is none."""
         pose = state @ self.mount
         ranges = trace(self.field, pose, measurement.angles, max_range=self.max_range, num_steps=self.num_steps)
         return scan_like(measurement, ranges)
 
+    @checked
     def covariance(self, state: SE2, measurement: LaserScan) -> Float[Array, "b b"]:
         """Independent ranges."""
         return jnp.eye(measurement.ranges.shape[0], dtype=self.sigma.dtype) * self.sigma**2
 
+    @checked
     def log_prob(self, state: SE2, measurement: LaserScan, valid: Bool[Array, "*m"]) -> Float[Array, ""]:
         """Log density of the scan at a pose; readings beyond `max_range` are clipped, non-finite ones ignored."""
         ranges = measurement.ranges

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.poses.lie_group import as_floats
@@ -49,6 +50,7 @@ class Pinhole(eqx.Module):
         self.lens = lens
 
     @staticmethod
+    @checked
     def from_matrix(matrix: Float[Array, "3 3"], lens: Lens | None = None) -> "Pinhole":
         """Camera of an upper triangular intrinsic matrix [T-15]."""
         scaled = matrix / matrix[2, 2]
@@ -60,11 +62,13 @@ class Pinhole(eqx.Module):
         rows = [[self.fx, self.skew, self.cx], [zero, self.fy, self.cy], [zero, zero, one]]
         return jnp.stack([jnp.stack(row) for row in rows])
 
+    @checked
     def projection_matrix(self, T_world_camera: SE3) -> Float[Array, "3 4"]:
         """``K [R^T, -R^T t]``: homogeneous world points to homogeneous pixels of the camera without its lens [T-19]."""
         return matmul(self.matrix(), T_world_camera.inverse().matrix()[:3])
 
     @eqx.filter_jit
+    @checked
     def project(self, points: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
         """Pixels of points in the camera frame.
 
@@ -89,6 +93,7 @@ class Pinhole(eqx.Module):
         return self.fx * x + self.skew * y + self.cx, self.fy * y + self.cy
 
     @eqx.filter_jit
+    @checked
     def in_front(self, points: Float[Array, "n 3"]) -> Bool[Array, " n"]:
         """Whether points are projected: in front of the camera and where its lens is one-to-one."""
         return self.in_front_components(points[:, 0], points[:, 1], points[:, 2])
@@ -112,11 +117,13 @@ class Pinhole(eqx.Module):
         return (x, y) if self.lens is None else self.lens.undistort(x, y)
 
     @eqx.filter_jit
+    @checked
     def normalize(self, pixels: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
         """Undistorted normalized coordinates (x/z, y/z) of pixels [T-16]."""
         return jnp.stack(self.normalize_components(pixels[:, 0], pixels[:, 1]), axis=-1)
 
     @eqx.filter_jit
+    @checked
     def bearing(self, pixels: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
         """Unit rays "n 3" of the camera frame through pixels "n 2"."""
         x, y = self.normalize_components(pixels[:, 0], pixels[:, 1])
@@ -124,6 +131,7 @@ class Pinhole(eqx.Module):
         return jnp.stack([x * scale, y * scale, scale], axis=-1)
 
     @eqx.filter_jit
+    @checked
     def unproject(self, pixels: Float[Array, "n 2"], depth: Float[Array, " n"]) -> Float[Array, "n 3"]:
         """Points of the camera frame at pixels.
 
@@ -138,6 +146,7 @@ class Pinhole(eqx.Module):
         return jnp.stack([x * depth, y * depth, depth], axis=-1)
 
 
+@checked
 def kelly_matrix(focal: Float[Array, ""]) -> Float[Array, "4 4"]:
     """Projection matrix with ``1/f`` in its last row and a row of zeros for depth [K-8].
 
@@ -157,6 +166,7 @@ def kelly_matrix(focal: Float[Array, ""]) -> Float[Array, "4 4"]:
 
 
 @eqx.filter_jit
+@checked
 def kelly_projection(points: Float[Array, "n 3"], focal: Float[Array, ""]) -> Float[Array, "n 2"]:
     """Image points ``(f x / (f + y), f z / (f + y))`` of points in a frame whose y axis is the optical axis [K-8].
 
@@ -179,6 +189,7 @@ def kelly_projection(points: Float[Array, "n 3"], focal: Float[Array, ""]) -> Fl
 
 
 @eqx.filter_jit
+@checked
 def kelly_camera(
     T_world_camera: SE3, points_world: Float[Array, "n 3"], focal: Float[Array, ""]
 ) -> Float[Array, "n 2"]:

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3
 from jaxloc.poses.lie_group import as_floats
@@ -104,6 +105,7 @@ class GroundCamera(eqx.Module):
         """Whether rays through pixels intersect the ground: below the horizon."""
         return self._rays(u, v)[1]
 
+    @checked
     def vanishing_point(self, heading: Float[Array, ""]) -> Float[Array, "2"]:
         """Vanishing point of lines on the ground in a direction, px.
 

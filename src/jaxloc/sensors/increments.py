@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc.beliefs import Motion
 from jaxloc.poses import SE2
 from jaxloc.poses.lie_group import as_floats
@@ -71,10 +72,12 @@ class IncrementMotion(Motion):
         self.drive, self.side, self.idle = as_floats(drive, side, idle)
         self.turn_drive, self.turn_turn, self.turn_idle = as_floats(turn_drive, turn_turn, turn_idle)
 
+    @checked
     def move(self, state: SE2, control: Increment) -> SE2:
         """The pose moved by the increment."""
         return state @ control.motion
 
+    @checked
     def covariance(self, state: SE2, control: Increment) -> Float[Array, "3 3"]:
         """Covariance of (along, across, heading) in the frame after the step."""
         del state

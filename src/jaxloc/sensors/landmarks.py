@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _tree as tree
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Sensor
 from jaxloc.poses import SE2, SO2
@@ -82,6 +83,7 @@ class RangeBearingSensor(Sensor):
         return jnp.diag(self.deviations**2)
 
 
+@checked
 def observe(sensor: SE2, landmark: Float[Array, "2"], index: Int[Array, ""]) -> RangeBearing:
     """Range and bearing of a landmark from T_world_sensor; finite and differentiable even at the landmark.
 
@@ -98,6 +100,7 @@ def observe(sensor: SE2, landmark: Float[Array, "2"], index: Int[Array, ""]) -> 
     return RangeBearing(distance, SO2(direction[0], direction[1]), index)
 
 
+@checked
 def locate(sensor: SE2, reading: RangeBearing) -> Float[Array, "2"]:
     """Position in the world of a landmark measured from T_world_sensor: the inverse of `observe`.
 
@@ -111,6 +114,7 @@ def locate(sensor: SE2, reading: RangeBearing) -> Float[Array, "2"]:
     return sensor.apply(local[None])[0]
 
 
+@checked
 def locate_covariance(sensor: SE2, reading: RangeBearing, deviations: Float[Array, "2"]) -> Float[Array, "2 2"]:
     """Covariance of `locate` by the noise of range and bearing, in the world.
 
@@ -127,6 +131,7 @@ def locate_covariance(sensor: SE2, reading: RangeBearing, deviations: Float[Arra
     return matmul(axes * scaled[None] ** 2, axes.T)
 
 
+@checked
 def polar_jacobian(reading: RangeBearing) -> Float[Array, "2 2"]:
     """Derivative of (range, bearing) by the landmark's position in the frame of the sensor.
 
@@ -142,6 +147,7 @@ def polar_jacobian(reading: RangeBearing) -> Float[Array, "2 2"]:
 
 
 @eqx.filter_jit
+@checked
 def confusion(
     sensor: RangeBearingSensor, poses: SE2, readings: RangeBearing, valid: Bool[Array, " t"], *, limit: float = 20.0
 ) -> Float[Array, "k k"]:
@@ -188,6 +194,7 @@ def confusion(
     return jnp.where((total > 0)[:, None], mean, limit)
 
 
+@checked
 def sanitize(reading: RangeBearing, valid: Bool[Array, ""]) -> tuple[RangeBearing, Bool[Array, ""]]:
     """A reading with non-finite values replaced, and whether it was valid, finite and within range."""
     values = jnp.stack([reading.range, reading.bearing.cos, reading.bearing.sin])
@@ -203,11 +210,13 @@ def pose_of(state: Any) -> SE2:
     return state if isinstance(state, SE2) else state.pose
 
 
+@checked
 def row(table: Float[Array, "k 2"], index: Int[Array, ""]) -> Float[Array, "2"]:
     """A row of a map; indices out of range are clipped."""
     return jnp.take(table, index, axis=0, mode="clip")
 
 
+@checked
 def length(offset: Float[Array, "2"]) -> Float[Array, ""]:
     """Length of a vector with a finite derivative at zero."""
     squared = jnp.sum(offset**2)

@@ -4,6 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
+
 SHORTEST = 1e-3  # least valid range, m
 
 
@@ -46,6 +48,7 @@ class LaserScan(eqx.Module):
         return LaserScan(self.ranges[..., first::step], angle_min, step * self.angle_increment)
 
 
+@checked
 def beam_mask(scan: LaserScan, valid: Bool[Array, "*m"], max_range: Float[Array, ""]) -> Bool[Array, " b"]:
     """Mask of the beams with a return: valid, finite, positive and below the largest range.
 
@@ -59,6 +62,7 @@ def beam_mask(scan: LaserScan, valid: Bool[Array, "*m"], max_range: Float[Array,
     return valid & jnp.isfinite(ranges) & (ranges > SHORTEST) & (ranges < max_range)
 
 
+@checked
 def discount(mask: Bool[Array, " b"], independent_beams: Float[Array, ""]) -> Float[Array, ""]:
     """Weight of each beam, so that all together count as at most `independent_beams`.
 

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
+
 _FAR = 100.0  # polynomial lenses are clipped at 89.4 degrees off the axis, where their powers would overflow float32
 _WIDEST = 1.5698  # largest angle off the axis of a fisheye lens, rad: its tangent is 1000
 _NEWTON_STEPS = 12
@@ -35,6 +37,7 @@ class Lens(eqx.Module):
     def in_domain(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
         """Whether the lens is one-to-one between the axis and these ideal points."""
 
+    @checked
     def can_undistort(self, xd: Float[Array, "*n"], yd: Float[Array, "*n"]) -> Bool[Array, "*n"]:
         """Whether `undistort` has converged: false outside the image of the one-to-one region of the lens."""
         x, y = self.undistort(xd, yd)
@@ -74,6 +77,7 @@ class BrownConrady(Lens):
                 "k1, k2, p1, p2, k3, k4, k5, k6."
             )
 
+    @checked
     def distort(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
         """Distorted points of ideal ones (clipped at 89.4 degrees off the axis)."""
         k = [self.coefficients[i] for i in range(self.coefficients.size)]
@@ -88,6 +92,7 @@ class BrownConrady(Lens):
         return x * gain + p1 * cross + p2 * (r2 + 2.0 * x * x), y * gain + p1 * (r2 + 2.0 * y * y) + p2 * cross
 
     @eqx.filter_jit
+    @checked
     def undistort(
         self, xd: Float[Array, "*n"], yd: Float[Array, "*n"]
     ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
@@ -112,6 +117,7 @@ class BrownConrady(Lens):
         x, y, _ = lax.fori_loop(0, _NEWTON_STEPS, improve, (*initial, jnp.ones_like(xd)))
         return _implicit_step(self, x, y, xd, yd)
 
+    @checked
     def in_domain(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
         """Whether the lens is one-to-one between the axis and these ideal points (it may fold beyond its image)."""
         ok = (jnp.abs(x) < _FAR) & (jnp.abs(y) < _FAR)
@@ -151,6 +157,7 @@ class KannalaBrandt(Lens):
         if self.coefficients.shape != (4,):
             raise ValueError(f"KannalaBrandt got coefficients of shape {self.coefficients.shape}; give k1, k2, k3, k4.")
 
+    @checked
     def distort(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
         """Distorted points of ideal ones."""
         r2 = x * x + y * y
@@ -160,6 +167,7 @@ class KannalaBrandt(Lens):
         return x * gain, y * gain
 
     @eqx.filter_jit
+    @checked
     def undistort(
         self, xd: Float[Array, "*n"], yd: Float[Array, "*n"]
     ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
@@ -180,6 +188,7 @@ class KannalaBrandt(Lens):
         gain = jnp.where(near, 1.0, jnp.tan(angle) / radius)
         return _implicit_step(self, target_x * gain, target_y * gain, xd, yd)
 
+    @checked
     def in_domain(self, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
         """Whether the image radius increases between the axis and these ideal points."""
         angle = jnp.arctan(_safe_root(x * x + y * y)[1])

@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc.beliefs.models import Sensor
 from jaxloc.poses import SE2
 from jaxloc.sensors.laser_scan import LaserScan, beam_mask, discount, scan_like
@@ -66,21 +67,25 @@ class LikelihoodField(Sensor):
             jnp.asarray(value, dtype) for value in (sigma, z_hit, max_range, independent_beams)
         )
 
+    @checked
     def expect(self, state: SE2, measurement: LaserScan) -> LaserScan:
         """Ranges to the obstacles of the map."""
         pose = state @ self.mount
         return scan_like(measurement, trace(self.field, pose, measurement.angles, max_range=self.max_range))
 
+    @checked
     def covariance(self, state: SE2, measurement: LaserScan) -> Float[Array, "b b"]:
         """Independent ranges with the standard deviation of end points."""
         return jnp.eye(measurement.ranges.shape[0], dtype=self.sigma.dtype) * self.sigma**2
 
+    @checked
     def distances(self, state: SE2, measurement: LaserScan, mask: Bool[Array, " b"]) -> Float[Array, " b"]:
         """Distance from the end point of each beam to the nearest obstacle, m; masked beams end at the laser."""
         ranges, angles = jnp.where(mask, measurement.ranges, 0.0), measurement.angles
         x, y = self._in_robot(ranges * jnp.cos(angles), ranges * jnp.sin(angles))
         return self.field.lookup(*self.field.to_grid(state, x, y))
 
+    @checked
     def log_prob(self, state: SE2, measurement: LaserScan, valid: Bool[Array, "*m"]) -> Float[Array, ""]:
         """Log density of the scan at a pose; masked beams are ignored."""
         mask = beam_mask(measurement, valid, self.max_range)

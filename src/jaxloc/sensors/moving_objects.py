@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Sensor
 from jaxloc.poses import SE3
@@ -74,11 +75,13 @@ class MovingObjectSensor(Sensor):
         self.rig, self.pose, self.pose_covariance = rig, pose, pose_covariance
         self.dt, self.sigma, self.points, self.extent, self.slack = as_floats(dt, sigma, points, extent, slack)
 
+    @checked
     def expect(self, state: Float[Array, "6"], measurement: Any) -> MovingObject:
         """The state itself."""
         del measurement
         return MovingObject(state[:3], state[3:])
 
+    @checked
     def covariance(self, state: Float[Array, "6"], measurement: Any) -> Float[Array, "6 6"]:
         """Covariance of (position, velocity)."""
         del measurement

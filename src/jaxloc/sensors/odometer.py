@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.beliefs.models import Motion, log_normal
 from jaxloc.poses import SE2, local
@@ -78,14 +79,17 @@ class OdometryMotion(Motion):
         self.turn_turn, self.turn_drive, self.drive_drive, self.drive_turn = arrays[:4]
         self.turn_floor, self.drive_floor, self.slip, self.slip_scale = arrays[4:]
 
+    @checked
     def move(self, state: SE2, control: SE2) -> SE2:
         """The pose moved by the odometry."""
         return state @ control
 
+    @checked
     def noise_dimension(self, state: SE2) -> int:
         """Two turns, a distance, and one number that decides on slip."""
         return 4
 
+    @checked
     def perturb(self, state: SE2, control: SE2, normal: Float[Array, "4"]) -> SE2:
         """The next pose for standard normal numbers."""
         first, drive, second = split_motion(control)
@@ -100,6 +104,7 @@ class OdometryMotion(Motion):
         turn = SE2(0.0 * x, 0.0 * x, sigma_first * normal[0] + sigma_second * normal[2])
         return state @ SE2.from_parts(control.rotation.compose(turn.rotation), jnp.stack([x, y]))
 
+    @checked
     def covariance(self, state: SE2, control: SE2) -> Float[Array, "3 3"]:
         """First-order covariance of the noise in the tangent space of the moved pose, slip included."""
         first, drive, second = split_motion(control)
@@ -107,6 +112,7 @@ class OdometryMotion(Motion):
         normal, slipped = (self._component(control, sigmas, drive, slipping) for slipping in (False, True))
         return (1.0 - self.slip) * normal + self.slip * slipped
 
+    @checked
     def log_prob(self, state: SE2, control: SE2, moved: SE2) -> Float[Array, ""]:
         """Log density of a next pose: a mixture of two normals, with and without slip, to first order."""
         first, drive, second = split_motion(control)
@@ -171,18 +177,22 @@ class DifferentialDrive(Motion):
     def __init__(self, track: Any, *, slip: Any = 0.02, floor: Any = 0.001, dtype: Any = float):
         self.track, self.slip, self.floor = (jnp.asarray(value, dtype) for value in (track, slip, floor))
 
+    @checked
     def move(self, state: SE2, control: Float[Array, "2"]) -> SE2:
         """The pose at the end of the arc."""
         return state @ self._arc(control)
 
+    @checked
     def noise_dimension(self, state: SE2) -> int:
         """One number per wheel."""
         return 2
 
+    @checked
     def perturb(self, state: SE2, control: Float[Array, "2"], normal: Float[Array, "2"]) -> SE2:
         """The next pose for standard normal numbers, one for each wheel."""
         return state @ self._arc(control + self._sigmas(control) * normal)
 
+    @checked
     def covariance(self, state: SE2, control: Float[Array, "2"]) -> Float[Array, "3 3"]:
         """First-order covariance in the tangent space of the moved pose, of rank two but for rounding."""
         angle = (control[1] - control[0]) / self.track
@@ -200,6 +210,7 @@ class DifferentialDrive(Motion):
         return jnp.sqrt(self.slip**2 * jnp.abs(control) + self.floor**2 + 1e-12)
 
 
+@checked
 def split_motion(motion: SE2) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """A relative pose as turn, distance and turn; the distance is negative for backward motion.
 
@@ -225,6 +236,7 @@ def split_motion(motion: SE2) -> tuple[Float[Array, ""], Float[Array, ""], Float
     return first, jnp.where(moved, forward * length, x), second
 
 
+@checked
 def falls_below(normal: Float[Array, "*n"], probability: Float[Array, ""]) -> Bool[Array, "*n"]:
     """Whether standard normal numbers fall into their lowest quantile of a probability.
 

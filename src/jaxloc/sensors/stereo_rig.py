@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc.sensors.camera import Pinhole
 
 _SMALLEST = 1e-6  # least disparity with a depth, px
@@ -44,6 +45,7 @@ class StereoRig(eqx.Module):
         self.baseline = jnp.asarray(baseline, camera.fx.dtype)
 
     @eqx.filter_jit
+    @checked
     def project(self, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Measurements (u_left, u_right, v), px, of points "n 3" in the left camera's frame, m [T-22]."""
         return self.project_components(points[:, 0], points[:, 1], points[:, 2]).T
@@ -57,6 +59,7 @@ class StereoRig(eqx.Module):
         disparity = self.camera.fx * self.baseline / jnp.where(front, z, 1.0)
         return jnp.stack([u_left, u_left - jnp.where(front, disparity, 0.0), v])
 
+    @checked
     def in_front(self, points: Float[Array, "n 3"]) -> Bool[Array, " n"]:
         """Whether points are projected (see `Pinhole.in_front`)."""
         return self.camera.in_front(points)
@@ -68,6 +71,7 @@ class StereoRig(eqx.Module):
         return self.camera.in_front_components(x, y, z)
 
     @eqx.filter_jit
+    @checked
     def triangulate(self, measurements: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Points of the left camera's frame, the exact inverse of `project`.
 
@@ -86,6 +90,7 @@ class StereoRig(eqx.Module):
         x, y = self.camera.normalize_components(u_left, v)
         return jnp.stack([x * z, y * z, z], axis=-1)
 
+    @checked
     def has_depth(self, measurements: Float[Array, "n 3"]) -> Bool[Array, " n"]:
         """Whether measurements have a positive disparity."""
         return measurements[:, 0] - measurements[:, 1] > _SMALLEST

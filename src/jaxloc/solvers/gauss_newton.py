@@ -256,7 +256,7 @@ def _weighted_rows(problem: Problem, y: Any, scale: Float[Array, " d"]) -> tuple
         j = j.reshape(j.shape[0], *r.shape)
         root = jnp.sqrt(kernel.weight(jnp.sum(r**2, axis=0)))
         residuals.append((r * root[None, :]).reshape(-1))
-        jacobians.append((j * root[None, None, :]).reshape(j.shape[0], -1).T * scale[None, :])
+        jacobians.append((j * root[None, None, :]).reshape(j.shape[0], r.size).T * scale[None, :])
     return jnp.concatenate(residuals), jnp.concatenate(jacobians)
 
 

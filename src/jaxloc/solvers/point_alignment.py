@@ -185,7 +185,7 @@ def _umeyama(
     scale = jnp.where(product > 0, product, 1.0) / jnp.where((product > 0) & (variance_s > 0), variance_s, 1.0)
     # Variances at rounding level count as zero.
     rounding = 8.0 * float(jnp.finfo(source.dtype).eps)
-    floor = [jnp.sum(weight) * (rounding * jnp.max(jnp.abs(c))) ** 2 for c in (source, target)]
+    floor = [jnp.sum(weight) * (rounding * jnp.max(jnp.abs(c), initial=0.0)) ** 2 for c in (source, target)]
     size = jnp.sqrt(variance_s) * jnp.sqrt(variance_t)
     determined = (variance_s > floor[0]) & (variance_t > floor[1]) & (gap > rank_tolerance(source.dtype) * size)
     translation = to_center - rotation.apply(from_center[None])[0]

@@ -1,5 +1,6 @@
 """Least-squares problems: a whitened residual with its data, normal equations and robust covariance."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -128,7 +129,8 @@ def with_losses(loss: Any, *trees: Any) -> list[tuple]:
 
 def items(residual: Array) -> Float[Array, "k n"]:
     """A residual array as components by items."""
-    return residual.reshape(-1, residual.shape[-1] if residual.ndim else 1)
+    # Sizes are given, since none can be inferred when there are no items.
+    return residual.reshape(math.prod(residual.shape[:-1]), residual.shape[-1] if residual.ndim else 1)
 
 
 def cost(problem: Problem, state: Any) -> Float[Array, ""]:
@@ -149,7 +151,7 @@ def normal_equations(problem: Problem, state: Any) -> NormalEquations:
     """Cost, gradient and IRLS Gauss-Newton Hessian: one matrix product of the stacked Jacobian and residual."""
     linear = problem.linearize(state)
     parts = [
-        _normal_part(kernel, items(r), j.reshape(j.shape[0], -1, items(r).shape[1]))
+        _normal_part(kernel, items(r), j.reshape(j.shape[0], *items(r).shape))
         for kernel, r, j in with_losses(problem.loss, linear.residual, linear.jacobian)
     ]
     if not parts:
@@ -167,12 +169,12 @@ def _normal_part(kernel: Loss, r: Float[Array, "k n"], j: Float[Array, "d k n"])
     stacked = jnp.concatenate([j, r[None]])
     size = stacked.shape[0]
     if isinstance(kernel, Quadratic):
-        flat = stacked.reshape(size, -1)
+        flat = stacked.reshape(size, r.size)
         product = matmul(flat, flat.T)
         return NormalEquations(0.5 * product[-1, -1], product[:-1, -1], product[:-1, :-1], None)
     squared = jnp.sum(r**2, axis=0)
     weight, slope = _weight_and_slope(kernel, squared)
-    product = matmul((stacked * weight[None, None, :]).reshape(size, -1), stacked.reshape(size, -1).T)
+    product = matmul((stacked * weight[None, None, :]).reshape(size, r.size), stacked.reshape(size, r.size).T)
     score = jnp.sum(j * r[None], axis=1)
     # At least a tenth of the weight remains along the residual.
     least = -0.9 * weight / jnp.where(squared > 0, squared, 1.0)
@@ -213,7 +215,7 @@ def sandwich(problem: Problem, state: Any) -> tuple[Float[Array, "d d"], Float[A
     """
     linear = problem.linearize(state)
     blocks = [
-        _scores(kernel, items(r), j.reshape(j.shape[0], -1, items(r).shape[1]))
+        _scores(kernel, items(r), j.reshape(j.shape[0], *items(r).shape))
         for kernel, r, j in with_losses(problem.loss, linear.residual, linear.jacobian)
     ]
     bread = _total([block.bread for block in blocks])
@@ -230,12 +232,12 @@ def sandwich(problem: Problem, state: Any) -> tuple[Float[Array, "d d"], Float[A
 
 
 def _scores(kernel: Loss, r: Float[Array, "k n"], j: Float[Array, "d k n"]) -> _Scores:
-    flat = j.reshape(j.shape[0], -1)
+    flat = j.reshape(j.shape[0], r.size)
     if isinstance(kernel, Quadratic):
         return _Scores(matmul(flat, flat.T), None, None)
     weight, slope = _weight_and_slope(kernel, jnp.sum(r**2, axis=0))
     score = jnp.sum(j * r[None], axis=1)
-    weighted = (j * weight[None, None, :]).reshape(j.shape[0], -1)
+    weighted = (j * weight[None, None, :]).reshape(j.shape[0], r.size)
     bread = matmul(weighted, flat.T) + 2.0 * matmul(score * slope[None, :], score.T)
 
     def leverage(inverse: Array) -> Array:

@@ -44,7 +44,7 @@ def classify(
         Label, position, scores of all templates, and whether the best is distinct.
 
     Raises:
-        ValueError: the score is a distance, or templates are larger than the image.
+        ValueError: the score is a distance, there are no templates, or templates are larger than the image.
 
     References:
         Pallet type by template correlation [K-75].
@@ -58,6 +58,9 @@ def classify(
     """
     if score.best_is_least:
         raise ValueError(f"classify: {type(score).__name__} depends on contrast; use a correlation.")
+
+    if not jnp.shape(templates)[0]:
+        raise ValueError("classify: no templates; at least one is needed.")
 
     def best(template: Array) -> tuple[Array, Array]:
         peaks = find_peaks(score_map(image, template, score=score), count=1)

@@ -133,6 +133,8 @@ def find_peaks(surface: Float[Array, "p q"], *, count: int = 4, separation: int 
     """
     if count < 1 or separation < 1:
         raise ValueError(f"find_peaks: count {count} and separation {separation} have to be at least 1.")
+    if not surface.size:
+        raise ValueError(f"find_peaks: a surface of shape {surface.shape} holds no value.")
     finite = jnp.isfinite(surface)
     safe = jnp.where(finite, surface, 0.0)
     left = _candidates(lax.stop_gradient(safe), finite)

@@ -153,6 +153,9 @@ def track_sequence(
     Returns:
         Results for every image but the first; lost points are not tracked again.
 
+    Raises:
+        ValueError: a video without images.
+
     Example:
         >>> import jax, jax.numpy as jnp
         >>> image = 100 * jax.random.uniform(jax.random.key(0), (60, 60))
@@ -160,6 +163,8 @@ def track_sequence(
         >>> followed.points.shape, bool(followed.ok.all())
         ((2, 1, 2), True)
     """
+    if not images.shape[0]:
+        raise ValueError("track_sequence: a video without images; the points are those of its first one.")
 
     def advance(state, image):
         frame, uv, ok = state

@@ -1,6 +1,6 @@
 """Figures."""
 
-from jaxloc.evaluation.plots import maps, objects, tracks, trajectories
+from jaxloc.evaluation.plots import canvas, maps, objects, tracks, trajectories
 from jaxloc.evaluation.plots.maps import MapImage, Snapshot, draw_clouds, draw_curves, draw_map_path
 from jaxloc.evaluation.plots.objects import draw_objects, encode
 from jaxloc.evaluation.plots.tracks import draw_counts, draw_tracks
@@ -9,6 +9,7 @@ from jaxloc.evaluation.plots.trajectories import draw_drift, draw_ellipses, draw
 __all__ = [
     "MapImage",
     "Snapshot",
+    "canvas",
     "draw_clouds",
     "draw_counts",
     "draw_curves",

@@ -10,6 +10,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxloc.evaluation.plots.canvas import add_curve, drawable, new_figure, space_by_factors, start_at_zero
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -79,15 +81,15 @@ def draw_map_path(
         ImportError: when matplotlib is not installed.
     """
     trusted = np.ones(len(poses), bool) if found is None else found
-    figure = _new_figure(9.0, 9.0 * _aspect(grid) + 0.6)
+    figure = new_figure(9.0, 9.0 * _aspect(grid) + 0.6)
     plot = figure.add_subplot()
     _add_map(plot, grid)
     if reference is not None:
-        plot.plot(reference[:, 0], reference[:, 1], color=_TRUTH, linewidth=2.6, alpha=0.35, label="reference")
+        add_curve(plot, reference[:, 0], reference[:, 1], color=_TRUTH, linewidth=2.6, alpha=0.35, label="reference")
     path = np.where(trusted[:, None], poses, np.nan)
-    plot.plot(path[:, 0], path[:, 1], color=_ESTIMATE, linewidth=1.1, label="estimate")
+    add_curve(plot, path[:, 0], path[:, 1], color=_ESTIMATE, linewidth=1.1, label="estimate")
     if not trusted.all():
-        plot.plot(*poses[~trusted, :2].T, ".", color=_CLOUD, markersize=3.0, label="not found yet")
+        plot.plot(*drawable(poses[~trusted, :2]).T, ".", color=_CLOUD, markersize=3.0, label="not found yet")
     plot.legend(frameon=True, framealpha=0.85, fontsize=8, loc="best")
     return figure
 
@@ -100,19 +102,21 @@ def draw_clouds(grid: MapImage, snapshots: Sequence[Snapshot]) -> "Figure":
         snapshots: in order.
 
     Returns:
-        The figure.
+        The figure; empty without snapshots.
 
     Raises:
         ImportError: when matplotlib is not installed.
     """
+    if not snapshots:
+        return new_figure(10.0, 1.0)
     columns = min(len(snapshots), 2 if _aspect(grid) < 0.8 else 3)
-    rows = -(-len(snapshots) // max(columns, 1))
+    rows = -(-len(snapshots) // columns)
     width = 10.0 / columns
-    figure = _new_figure(10.0, rows * (width * _aspect(grid) + 0.35))
+    figure = new_figure(10.0, rows * (width * _aspect(grid) + 0.35))
     for number, snapshot in enumerate(snapshots, start=1):
         plot = figure.add_subplot(rows, columns, number)
         _add_map(plot, grid)
-        plot.plot(*snapshot.cloud[:, :2].T, ".", color=_CLOUD, markersize=2.2, alpha=0.6)
+        plot.plot(*drawable(snapshot.cloud[:, :2]).T, ".", color=_CLOUD, markersize=2.2, alpha=0.6)
         if snapshot.truth is not None:
             _add_arrow(plot, snapshot.truth, _TRUTH)
         _add_arrow(plot, snapshot.pose, _ESTIMATE)
@@ -131,9 +135,9 @@ def draw_curves(
 
     Args:
         times: s.
-        curves: by name; a number that is not finite leaves a gap.
-        label: of the vertical axis, with the unit.
-        logarithmic: spaces that axis by factors.
+        curves: by name; a number that is not finite, or beyond 1e100, leaves a gap.
+        label: of the vertical axis, with the unit. The axis begins at zero where no number is negative.
+        logarithmic: spaces that axis by factors; around zero linearly, where there are numbers that are not positive.
 
     Returns:
         The figure.
@@ -141,29 +145,18 @@ def draw_curves(
     Raises:
         ImportError: when matplotlib is not installed.
     """
-    figure = _new_figure(8.0, 3.0)
+    figure = new_figure(8.0, 3.0)
     plot = figure.add_subplot()
     plot.spines[["top", "right"]].set_visible(False)
     plot.grid(True, color="#e6e8eb", linewidth=0.8)
     for (name, values), color in zip(curves.items(), (_ESTIMATE, _CLOUD, _QUIET, _TRUTH), strict=False):
-        plot.plot(times, values, color=color, linewidth=1.1, label=name)
-    if logarithmic:
-        plot.set_yscale("log")
-    else:
-        plot.set_ylim(bottom=0.0)
+        add_curve(plot, times, values, color=color, linewidth=1.1, label=name)
+    (space_by_factors if logarithmic else start_at_zero)(plot, *curves.values())
     plot.set_xlabel("time (s)")
     plot.set_ylabel(label)
     if len(curves) > 1:
         plot.legend(frameon=False, ncols=3, fontsize=8)
     return figure
-
-
-def _new_figure(width: float, height: float) -> Any:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('figures need matplotlib: pip install "jaxloc[plot]"') from error
-    return Figure(figsize=(width, height), layout="constrained", facecolor="white")
 
 
 def _extent(grid: MapImage) -> tuple[float, float, float, float]:
@@ -198,7 +191,9 @@ def _add_map(plot: Any, grid: MapImage) -> None:
 
 
 def _add_arrow(plot: Any, pose: np.ndarray, color: str) -> None:
-    x, y, heading = pose
+    x, y, heading = drawable(pose)
+    if not np.isfinite(x + y + heading):
+        return
     step = (_ARROW * np.cos(heading), _ARROW * np.sin(heading))
     style = dict(width=0.1, head_width=0.4, head_length=0.35, length_includes_head=False, linewidth=0, zorder=3)
     plot.arrow(x, y, *step, color=color, **style)

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxloc.evaluation.plots.canvas import drawable, new_figure
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -29,21 +31,29 @@ def draw_objects(
         uv: where tracks are, px.
         labels: their numbers.
         speeds: m/s.
-    """
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Rectangle
 
+    Returns:
+        The figure; what has no finite place is left out.
+
+    Raises:
+        ImportError: when matplotlib is not installed.
+    """
     pixels = np.asarray(image)
     height, width = pixels.shape
-    figure = Figure(figsize=(10.0, 10.0 * height / width + 0.3), layout="constrained")
+    figure = new_figure(10.0, 10.0 * height / width + 0.3)
+    from matplotlib.patches import Rectangle
+
+    points, boxes, uv = drawable(points), drawable(boxes), drawable(uv)
     plot = figure.add_subplot()
     plot.imshow(pixels, cmap="gray", vmin=0, vmax=255)
     plot.plot(points[:, 0], points[:, 1], ".", color="#e8590c", markersize=3)
-    for left, top, right, bottom in boxes:
+    for left, top, right, bottom in boxes[np.isfinite(boxes).all(axis=1)]:
         plot.add_patch(
             Rectangle((left - 4, top - 4), right - left + 8, bottom - top + 8, fill=False, color="#ffd43b", linewidth=1)
         )
     for (u, v), label, speed in zip(uv, labels, speeds, strict=True):
+        if not np.isfinite(u + v):
+            continue
         plot.plot(u, v, "+", color="#4dabf7", markersize=10)
         plot.annotate(
             f"{label}: {speed:.1f} m/s", (u, v), xytext=(4, 10), textcoords="offset points", color="#4dabf7", fontsize=8

@@ -3,10 +3,12 @@
 matplotlib is an extra, loaded when the first figure is drawn; its global state (pyplot) is never touched.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from jaxloc.evaluation.plots.canvas import add_curve, drawable, new_figure, start_at_zero
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,21 +48,23 @@ def draw_tracks(
     Raises:
         ImportError: when matplotlib is not installed.
     """
-    figure = _figure(8.0, 5.5)
+    figure = new_figure(8.0, 5.5)
     plot = figure.add_subplot()
     plot.grid(True, color=_QUIET, linewidth=0.8)
     plot.set_axisbelow(True)
     right, up = axes
     if truth is not None:
-        shown = truth[np.ones(truth.shape[:2], bool) if truth_valid is None else truth_valid]
+        shown = drawable(truth)[np.ones(truth.shape[:2], bool) if truth_valid is None else truth_valid]
         plot.plot(shown[:, right], shown[:, up], ".", color=_TRUTH, markersize=5, alpha=0.15, label="truth")
     if camera is not None:
-        plot.plot(camera[:, right], camera[:, up], color=_CAMERA, linewidth=1.2, linestyle="--", label="camera")
+        add_curve(plot, camera[:, right], camera[:, up], color=_CAMERA, linewidth=1.2, linestyle="--", label="camera")
     for identity in np.unique(ids[valid]).tolist():
-        path = _path(places, valid & (ids == identity))
+        path = _path(drawable(places), valid & (ids == identity))
         color = _COLORS[identity % len(_COLORS)]
-        plot.plot(path[:, right], path[:, up], color=color, linewidth=1.3)
-        plot.annotate(str(identity), path[-1, [right, up]], fontsize=6, color=color)
+        add_curve(plot, path[:, right], path[:, up], color=color, linewidth=1.3)
+        ends = path[np.isfinite(path).all(axis=1)][-1:]
+        for end in ends:
+            plot.annotate(str(identity), end[[right, up]], fontsize=6, color=color)
     names = "xyz"
     plot.set_xlabel(f"{names[right]} ({unit})")
     plot.set_ylabel(f"{names[up]} ({unit})")
@@ -87,14 +91,16 @@ def draw_counts(
     Raises:
         ImportError: when matplotlib is not installed.
     """
-    figure = _figure(8.0, 2.6)
+    figure = new_figure(8.0, 2.6)
     plot = figure.add_subplot()
     plot.spines[["top", "right"]].set_visible(False)
     plot.grid(True, color=_QUIET, linewidth=0.8)
     if truth is not None:
         plot.step(times, truth, where="post", color=_TRUTH, linewidth=2.5, alpha=0.35, label="truth")
-    plot.step(times, found, where="post", color=_COLORS[0], linewidth=1.2, label="tracks")
-    plot.set_ylim(bottom=0.0)
+    # Without a marker a single instant would not be seen.
+    marker = "." if len(times) == 1 else ""
+    plot.step(times, found, where="post", color=_COLORS[0], linewidth=1.2, marker=marker, label="tracks")
+    start_at_zero(plot, found, *(() if truth is None else (truth,)))
     plot.set_xlabel("time (s)")
     plot.set_ylabel("number")
     plot.legend(frameon=False, ncols=2, fontsize=8)
@@ -105,11 +111,3 @@ def _path(places: np.ndarray, there: np.ndarray) -> np.ndarray:
     """Places of one track in the order of frames."""
     frames, slots = np.nonzero(there)
     return places[frames, slots]
-
-
-def _figure(width: float, height: float) -> Any:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('figures need matplotlib: pip install "jaxloc[plot]"') from error
-    return Figure(figsize=(width, height), layout="constrained", facecolor="white")

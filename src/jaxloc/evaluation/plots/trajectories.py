@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from jaxloc.evaluation.plots.canvas import add_curve, drawable, new_figure, start_at_zero
 from jaxloc.poses import Trajectory
 
 if TYPE_CHECKING:
@@ -20,11 +21,7 @@ _SIGMAS_95 = 2.4477
 
 
 def _figure(width: float, height: float) -> tuple[Any, Any]:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('figures need matplotlib: pip install "jaxloc[plot]"') from error
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    figure = new_figure(width, height)
     axes = figure.add_subplot()
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="#e6e8eb", linewidth=0.8)
@@ -58,15 +55,16 @@ def draw_trajectory(
     """
     figure, plot = _figure(7.0, 4.6)
     right, up = axes
-    extent = np.ptp(np.asarray(estimate.positions), axis=0)
+    path = drawable(estimate.positions)
+    seen = path[np.isfinite(path).all(axis=1)]
+    extent = np.ptp(seen, axis=0) if len(seen) else np.zeros(3)
     if extent[up] > extent[right]:
         right, up = up, right
         plot.yaxis.set_inverted(True)
     if truth is not None:
-        path = np.asarray(truth.positions)
-        plot.plot(path[:, right], path[:, up], color=_TRUTH, linewidth=2.5, alpha=0.35, label="truth")
-    path = np.asarray(estimate.positions)
-    plot.plot(path[:, right], path[:, up], color=_ESTIMATE, linewidth=1.6, label="estimate")
+        true_path = drawable(truth.positions)
+        add_curve(plot, true_path[:, right], true_path[:, up], color=_TRUTH, linewidth=2.5, alpha=0.35, label="truth")
+    add_curve(plot, path[:, right], path[:, up], color=_ESTIMATE, linewidth=1.6, label="estimate")
     plot.plot(path[:1, right], path[:1, up], "o", color=_ESTIMATE, markersize=6)
     if covariances is not None:
         _add_ellipses(plot, np.asarray(estimate.matrices()), covariances, (right, up), num_ellipses)
@@ -81,7 +79,9 @@ def draw_trajectory(
 def _add_ellipses(plot, matrices, covariances, axes: tuple[int, int], count: int) -> None:
     from matplotlib.patches import Ellipse
 
-    chosen = np.unique(np.linspace(0, len(matrices) - 1, count).round().astype(int))
+    matrices, covariances = drawable(matrices), drawable(covariances)
+    known = np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2)) & np.isfinite(covariances).all(axis=(1, 2)))
+    chosen = known[np.unique(np.linspace(0, len(known) - 1, count if len(known) else 0).round().astype(int))]
     for number, index in enumerate(chosen):
         rotation = matrices[index, :3, :3]
         position = rotation @ covariances[index][:3, :3] @ rotation.T
@@ -114,17 +114,17 @@ def draw_ellipses(
     """
     figure, plot = _figure(7.0, 3.4)
     times = np.asarray(estimate.times)
-    sigmas = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2)[:, :3], 0.0))
+    sigmas = np.sqrt(np.maximum(drawable(np.diagonal(covariances, axis1=1, axis2=2)[:, :3]), 0.0))
     colors = (_ESTIMATE, "#2f9e44", _WRONG)
     for axis, (name, color) in enumerate(zip(("right", "down", "forward"), colors, strict=True)):
         plot.fill_between(times, -3 * sigmas[:, axis], 3 * sigmas[:, axis], color=color, alpha=0.12, linewidth=0)
         if truth is not None:
-            matrices = np.asarray(estimate.matrices())
-            gap = np.asarray(truth.positions) - matrices[:, :3, 3]
+            matrices = drawable(estimate.matrices())
+            gap = drawable(truth.positions) - matrices[:, :3, 3]
             error = np.einsum("nij,ni->nj", matrices[:, :3, :3], gap)[:, axis]
-            plot.plot(times, error, color=color, linewidth=1.4, label=name)
+            add_curve(plot, times, error, color=color, linewidth=1.4, label=name)
         else:
-            plot.plot(times, 3 * sigmas[:, axis], color=color, linewidth=1.4, label=name)
+            add_curve(plot, times, 3 * sigmas[:, axis], color=color, linewidth=1.4, label=name)
     plot.set_xlabel("time (s)")
     plot.set_ylabel("position error and 3 sigma (m)" if truth is not None else "3 sigma (m)")
     plot.legend(frameon=False, ncols=3)
@@ -145,10 +145,10 @@ def draw_drift(distances: Float[np.ndarray, " n"], percent: Float[np.ndarray, " 
         ImportError: when matplotlib is not installed.
     """
     figure, plot = _figure(7.0, 3.0)
-    plot.plot(distances, percent, color=_ESTIMATE, linewidth=1.6)
+    add_curve(plot, distances, percent, color=_ESTIMATE, linewidth=1.6)
     plot.set_xlabel("distance traveled (m)")
     plot.set_ylabel("drift (% of the distance)")
-    plot.set_ylim(bottom=0.0)
+    start_at_zero(plot, percent)
     return figure
 
 
@@ -174,6 +174,7 @@ def draw_matches(
     """
     height, width = image.shape
     figure, plot = _figure(9.0, 9.0 * height / width + 0.4)
+    previous, current = drawable(previous), drawable(current)
     plot.imshow(image, cmap="gray", vmin=0, vmax=255)
     for keep, color, label in ((inlier, "#37b24d", "agrees"), (~inlier, _WRONG, "rejected")):
         segments = np.stack([previous[keep], current[keep], np.full_like(current[keep], np.nan)], axis=1).reshape(-1, 2)
@@ -190,7 +191,7 @@ def draw_timings(stages: Mapping[str, Float[np.ndarray, " n"]]) -> "Figure":
     """Draws how long each stage takes a frame: the median, and a thin line up to the 95th percentile.
 
     Args:
-        stages: times by the name of the stage, s.
+        stages: times by the name of the stage, s; those that are not finite are left out.
 
     Returns:
         The figure.
@@ -199,9 +200,10 @@ def draw_timings(stages: Mapping[str, Float[np.ndarray, " n"]]) -> "Figure":
         ImportError: when matplotlib is not installed.
     """
     figure, plot = _figure(7.0, 0.9 + 0.4 * max(len(stages), 1))
-    names = list(stages)[::-1]
-    medians = [1000.0 * float(np.median(stages[name])) for name in names]
-    slow = [1000.0 * float(np.percentile(stages[name], 95)) for name in names]
+    known = {name: times[np.isfinite(times)] for name, times in ((n, drawable(t)) for n, t in stages.items())}
+    names = [name for name in list(stages)[::-1] if len(known[name])]
+    medians = [1000.0 * float(np.median(known[name])) for name in names]
+    slow = [1000.0 * float(np.percentile(known[name], 95)) for name in names]
     plot.barh(names, medians, color=_ESTIMATE, height=0.55)
     plot.hlines(names, medians, slow, color=_QUIET, linewidth=2.0)
     for name, median, end in zip(names, medians, slow, strict=True):

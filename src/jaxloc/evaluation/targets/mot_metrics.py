@@ -102,7 +102,7 @@ class ClearMot(eqx.Module):
     """CLEAR MOT.
 
     Attributes:
-        mota: one minus false positives, misses and switches in true detections.
+        mota: one minus false positives, misses and switches in true detections; zero where there are none.
         motp: mean similarity of the matches.
         true_positives: matches.
         false_positives: estimates without a match.
@@ -219,6 +219,11 @@ def join(comparisons: Sequence[Comparison]) -> Comparison:
 def clear_mot(tracks: Comparison, *, threshold: float = 0.5) -> ClearMot:
     """CLEAR MOT: in each frame, matches of the frame before go on where they can; the others are the most similar.
 
+    Where reference implementations differ, this follows TrackEval's results of one sequence: a frame without truth or
+    without estimates interrupts no track (py-motmetrics counts an interruption in the latter), only matches of the
+    frame before are preferred (py-motmetrics: the last match, however long ago), and MOTA is zero without any truth
+    (py-motmetrics: minus infinity; TrackEval's total of several such sequences: minus the false positives).
+
     Args:
         tracks: true and estimated ones.
         threshold: least similarity of a match.
@@ -252,7 +257,7 @@ def clear_mot(tracks: Comparison, *, threshold: float = 0.5) -> ClearMot:
     false = int(found.sum()) - hits
     covered = matched / np.maximum(counts, 1.0)
     return ClearMot(
-        mota=(hits - false - switches) / max(size, 1),
+        mota=(hits - false - switches) / size if size else 0.0,
         motp=float(total) / max(hits, 1),
         true_positives=hits,
         false_positives=false,

@@ -1,6 +1,8 @@
 """OSPA, GOSPA and OSPA(2) distances between sets of targets.
 
-Sets are padded: values with a mask. Estimates come first, truth second.
+Sets are padded: values with a mask. Estimates come first, truth second. Points that are not finite, or so far away that
+their distance is not, count and match none. A cutoff that is no positive number, or whose power is beyond what the
+dtype holds, gives ``ok`` False, finite distances and no gradients.
 
 References:
     Schuhmacher, Vo and Vo, "A consistent metric for performance evaluation of multi-object filters", IEEE TSP 2008.
@@ -27,11 +29,13 @@ class Ospa(eqx.Module):
         distance: in the units of the cutoff, between zero and it.
         localization: part of the errors of matched targets; pairs farther apart than the cutoff count as it.
         cardinality: part of the difference in number.
+        ok: whether the cutoff is one; without it the distance means nothing.
     """
 
     distance: Float[Array, "*t"]
     localization: Float[Array, "*t"]
     cardinality: Float[Array, "*t"]
+    ok: Bool[Array, "*t"]
 
 
 class Gospa(eqx.Module):
@@ -44,6 +48,7 @@ class Gospa(eqx.Module):
         false: what estimates cost that are matched to none.
         num_missed: how many.
         num_false: how many.
+        ok: whether cutoff and alpha are within their bounds; without that the distance means nothing.
     """
 
     distance: Float[Array, ""]
@@ -52,6 +57,7 @@ class Gospa(eqx.Module):
     false: Float[Array, ""]
     num_missed: Int[Array, ""]
     num_false: Int[Array, ""]
+    ok: Bool[Array, ""]
 
 
 class _Match(eqx.Module):
@@ -75,6 +81,7 @@ def ospa(
     """The OSPA distance of two sets of points: the error of a target on average, where a missing one costs the cutoff.
 
     ``(1/n min_pi sum_i min(d_i, c)^p + c^p |n - m| / n)^(1/p)``, where n is the larger number; zero for two empty sets.
+    Above order one, Stone Soup's figure can be larger: it matches by the distances, not by their powers.
 
     Args:
         x: estimates; non-finite ones count, and match none.
@@ -102,8 +109,9 @@ def ospa(
 
 @eqx.filter_jit
 def _ospa(x: Array, valid_x: Array, y: Array, valid_y: Array, cutoff: Array, order: float) -> Ospa:
-    match = _match(_distances(x, y, order), valid_x, valid_y, cutoff**order)
-    return _ospa_of(match, cutoff, order)
+    cutoff, ok = _usable_cutoff(cutoff, order)
+    match = _match(_distances(x, y, cutoff, order), valid_x, valid_y, cutoff**order)
+    return _ospa_of(match, cutoff, order, ok)
 
 
 def gospa(
@@ -128,7 +136,7 @@ def gospa(
         valid_y: which there are.
         cutoff: c, error beyond which two points are no match.
         order: p, at least one.
-        alpha: above zero, at most two.
+        alpha: above zero (1e-6), at most two.
 
     Returns:
         The distance and its parts. Gradients are those of the matching that is best.
@@ -149,8 +157,11 @@ def gospa(
 
 @eqx.filter_jit
 def _gospa(x: Array, valid_x: Array, y: Array, valid_y: Array, cutoff: Array, alpha: Array, order: float) -> Gospa:
+    cutoff, ok = _usable_cutoff(cutoff, order)
+    bounded = (alpha >= 1e-6) & (alpha <= 2.0)
+    ok, alpha = ok & bounded, jnp.where(bounded, alpha, 2.0)
     limit = cutoff**order
-    match = _match(_distances(x, y, order), valid_x, valid_y, limit)
+    match = _match(_distances(x, y, cutoff, order), valid_x, valid_y, limit)
     both = jnp.minimum(match.size_x, match.size_y)
 
     def left_over(size: Array) -> Array:
@@ -161,7 +172,7 @@ def _gospa(x: Array, valid_x: Array, y: Array, valid_y: Array, cutoff: Array, al
     missed, false = left_over(match.size_y), left_over(match.size_x)
     total = match.cost + missed + false
     numbers = match.size_y - match.pairs, match.size_x - match.pairs
-    return Gospa(_power(total, 1.0 / order), match.cost, missed, false, *numbers)
+    return Gospa(_power(total, 1.0 / order), match.cost, missed, false, *numbers, ok)
 
 
 def ospa2(
@@ -209,8 +220,9 @@ def ospa2(
 
 @eqx.filter_jit
 def _ospa2(x: Array, valid_x: Array, y: Array, valid_y: Array, cutoff: Array, window: int, order: float) -> Ospa:
+    cutoff, ok = _usable_cutoff(cutoff, order)
     limit = cutoff**order
-    errors = jax.vmap(lambda a, b: _distances(a, b, order), in_axes=(1, 1), out_axes=2)(x, y)
+    errors = jax.vmap(lambda a, b: _distances(a, b, cutoff, order), in_axes=(1, 1), out_axes=2)(x, y)
     one, other = valid_x[:, None], valid_y[None]
     both = one & other & jnp.isfinite(errors)
     errors = jnp.where(both, jnp.minimum(jnp.where(both, errors, 0.0), limit), jnp.where(one | other, limit, 0.0))
@@ -219,16 +231,33 @@ def _ospa2(x: Array, valid_x: Array, y: Array, valid_y: Array, cutoff: Array, wi
     seen_x, seen_y = (_sliding(valid.astype(x.dtype), window) > 0 for valid in (valid_x, valid_y))
 
     def at(mean: Array, here_x: Array, here_y: Array) -> Ospa:
-        return _ospa_of(_match(mean, here_x, here_y, limit), cutoff, order)
+        return _ospa_of(_match(mean, here_x, here_y, limit), cutoff, order, ok)
 
     return jax.vmap(at, in_axes=(2, 1, 1))(means, seen_x, seen_y)
 
 
-def _distances(x: Float[Array, "n d"], y: Float[Array, "m d"], order: float) -> Float[Array, "n m"]:
-    """Euclidean distances to a power; infinite where a number is bad."""
-    finite = jnp.all(jnp.isfinite(x), axis=1)[:, None] & jnp.all(jnp.isfinite(y), axis=1)[None]
-    gaps = jnp.where(finite[..., None], x[:, None], 0.0) - jnp.where(finite[..., None], y[None], 0.0)
-    return jnp.where(finite, _power(jnp.sum(gaps**2, axis=-1), 0.5 * order), jnp.inf)
+def _usable_cutoff(cutoff: Float[Array, ""], order: float) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """The cutoff, or the nearest one that can be used, without derivatives; and whether it is its own."""
+    numbers = jnp.finfo(cutoff.dtype)
+    # Room for sums of a million errors, also divided by the least alpha.
+    lowest, highest = (float(bound) ** (1.0 / order) for bound in (numbers.tiny, numbers.max * 1e-14))
+    ok = (cutoff >= lowest) & (cutoff <= highest)
+    return jnp.where(ok, cutoff, jnp.where(cutoff > highest, highest, 0.0)), ok
+
+
+def _distances(
+    x: Float[Array, "n d"], y: Float[Array, "m d"], cutoff: Float[Array, ""], order: float
+) -> Float[Array, "n m"]:
+    """Euclidean distances to a power; infinite where a number is not finite, or well above the cutoff."""
+    # Squares of larger numbers overflow.
+    largest = 1e-3 * float(jnp.finfo(x.dtype).max) ** 0.5
+    finite = [jnp.all(jnp.abs(points) < largest, axis=1) for points in (x, y)]
+    both = finite[0][:, None] & finite[1][None]
+    gaps = jnp.where(both[..., None], x[:, None], 0.0) - jnp.where(both[..., None], y[None], 0.0)
+    squared = jnp.sum(gaps**2, axis=-1)
+    # No power of a distance that does not matter, whose derivative could overflow.
+    near = both & (squared < 2.0 * lax.stop_gradient(cutoff) ** 2)
+    return jnp.where(near, _power(jnp.where(near, squared, 0.0), 0.5 * order), jnp.inf)
 
 
 def _match(costs: Float[Array, "n m"], valid_x: Array, valid_y: Array, limit: Float[Array, ""]) -> _Match:
@@ -242,14 +271,14 @@ def _match(costs: Float[Array, "n m"], valid_x: Array, valid_y: Array, limit: Fl
     return _Match(jnp.sum(jnp.where(taken, picked, 0.0)), *sizes)
 
 
-def _ospa_of(match: _Match, cutoff: Float[Array, ""], order: float) -> Ospa:
+def _ospa_of(match: _Match, cutoff: Float[Array, ""], order: float, ok: Bool[Array, ""]) -> Ospa:
     dtype = cutoff.dtype
     fewer, more = jnp.minimum(match.size_x, match.size_y), jnp.maximum(match.size_x, match.size_y)
     size = jnp.maximum(more, 1).astype(dtype)
     limit = cutoff**order
     near = (match.cost + limit * (fewer - match.pairs).astype(dtype)) / size
     number = limit * (more - fewer).astype(dtype) / size
-    return Ospa(*(_power(part, 1.0 / order) for part in (near + number, near, number)))
+    return Ospa(*(_power(part, 1.0 / order) for part in (near + number, near, number)), ok)
 
 
 def _power(value: Array, exponent: float) -> Array:

@@ -134,7 +134,7 @@ def end_drift_percent(estimate: Trajectory, truth: Trajectory) -> Float[Array, "
         truth: the true path, pose by pose.
 
     Returns:
-        Drift, %; zero for a path of no length.
+        Drift, %; zero for a path of no length, or without poses.
 
     Raises:
         ValueError: when the paths have different numbers of poses.
@@ -145,7 +145,8 @@ def end_drift_percent(estimate: Trajectory, truth: Trajectory) -> Float[Array, "
         >>> bool(end_drift_percent(path, path) < 1e-3)
         True
     """
-    return drift_curve_percent(estimate, truth)[-1]
+    curve = drift_curve_percent(estimate, truth)
+    return curve[-1] if len(truth) else jnp.zeros((), curve.dtype)
 
 
 @eqx.filter_jit

@@ -27,6 +27,8 @@ def path_distances(positions: Float[Array, "n 3"]) -> Float[Array, " n"]:
     Returns:
         Distances, m; the first is zero.
     """
+    if not positions.shape[0]:
+        return jnp.zeros(0, positions.dtype)
     return jnp.concatenate([jnp.zeros(1, positions.dtype), jnp.cumsum(step_lengths(positions))])
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _tree as tree
+from jaxloc._arguments import checked
 from jaxloc.poses import SE3
 from jaxloc.refinement.bundle.estimate import BundleEstimate
 from jaxloc.refinement.bundle.gradient import BundleEquations
@@ -19,6 +20,7 @@ from jaxloc.solvers import LevenbergMarquardt, Loss, Quadratic, Status
 from jaxloc.solvers.implicit_gradient import attach_gradient
 
 
+@checked
 def adjust(
     model: Pinhole | StereoRig,
     initial: Bundle,

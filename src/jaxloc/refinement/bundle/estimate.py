@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import SE3
@@ -46,6 +47,7 @@ class BundleEstimate(eqx.Module):
     structure: Structure
 
     @eqx.filter_jit
+    @checked
     def pose_covariance(self, cameras: Int[Array, " q"]) -> Float[Array, "q 6 q 6"]:
         """Joint covariance of chosen poses in their tangents (right perturbation); zero for fixed ones.
 
@@ -69,6 +71,7 @@ class BundleEstimate(eqx.Module):
         return jnp.where((free[:, None] & free[None, :])[:, None, :, None], _finite(blocks), 0.0)
 
     @eqx.filter_jit
+    @checked
     def point_covariance(self, points: Int[Array, " q"]) -> Float[Array, "q 3 3"]:
         """Covariance of each of chosen points, world frame, m^2.
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _linalg
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.refinement.bundle.structure import Structure
@@ -68,6 +69,7 @@ class Bundle(eqx.Module):
     poses: SE3
     points: Float[Array, "n 3"]
 
+    @checked
     def moved(self, cameras: Float[Array, "c 6"], points: Float[Array, "n 3"]) -> "Bundle":
         """The bundle with poses retracted (right perturbation) and points added to."""
         return Bundle(jax.vmap(lambda pose, delta: pose.retract(delta))(self.poses, cameras), self.points + points)
@@ -92,6 +94,7 @@ class Gauge(eqx.Module):
         return Gauge(jnp.zeros(num_cameras, bool).at[jnp.asarray(cameras, jnp.int32)].set(True))
 
     @staticmethod
+    @checked
     def prior(poses: SE3, covariance: Float[Array, "c 6 6"], valid: Bool[Array, " c"]) -> "Gauge":
         """Pose priors with covariances, where ``valid``."""
         eye = jnp.eye(6, dtype=covariance.dtype)
@@ -99,18 +102,21 @@ class Gauge(eqx.Module):
         information = jnp.where(valid[:, None, None], jax.vmap(_linalg.inverse)(safe), 0.0)
         return Gauge(jnp.zeros(valid.shape, bool), poses, information)
 
+    @checked
     def cost(self, poses: SE3) -> Float[Array, ""]:
         """Half the squared Mahalanobis distance from the anchors."""
         if self.anchors is None or self.information is None:
             return jnp.zeros((), poses.translation.dtype)
         return jnp.sum(jax.vmap(_anchor_cost)(poses, self.anchors, self.information))
 
+    @checked
     def gradients(self, poses: SE3) -> Float[Array, "c 6"]:
         """Gradient of the cost in the tangents of the poses."""
         if self.anchors is None or self.information is None:
             return jnp.zeros((*poses.batch_shape, 6), poses.translation.dtype)
         return jax.vmap(_anchor_gradient)(poses, self.anchors, self.information)
 
+    @checked
     def hessians(self, poses: SE3, exact: bool) -> Float[Array, "c 6 6"]:
         """Hessian of the cost: Gauss-Newton, or exact."""
         if self.anchors is None or self.information is None:
@@ -197,6 +203,7 @@ class BundleProblem(eqx.Module):
         safe = jnp.where(good[:, None], measured, 0.0), 1.0 / jnp.where(good[:, None], sigma, 1.0)
         return BundleProblem(model, camera, point, safe[0].T, safe[1].T, good, gauge, loss)
 
+    @checked
     def project(self, frame: Float[Array, "3 m"]) -> Float[Array, "k m"]:
         """Measurements predicted for points in the camera's frame."""
         shown = self.model.project_components(frame[0], frame[1], frame[2])
@@ -212,6 +219,7 @@ class BundleProblem(eqx.Module):
         forward = jnp.array([0.0, 0.0, 1.0], moved.dtype)[:, None]
         return jnp.where(visible[None], moved, forward), rotation, visible
 
+    @checked
     def item_cost(self, frame: Float[Array, "3 m"]) -> Float[Array, " m"]:
         """Cost of each observation for points in the frames of the cameras."""
         error = (self.project(frame) - self.measured) * self.inverse_sigma
@@ -275,6 +283,7 @@ def _along_axes(function: Any, frame: Float[Array, "3 m"]) -> Float[Array, "3 k 
     return jnp.stack([along(axes[i]) for i in range(3)])
 
 
+@checked
 def pose_rows(slope: Float[Array, "3 *k m"], frame: Float[Array, "3 m"]) -> Float[Array, "6 *k m"]:
     """Chain rule to the pose's tangent: a right perturbation (v, w) moves the point by ``-v + c x w``."""
     gx, gy, gz = slope[0], slope[1], slope[2]

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxloc._arguments import checked
+
 # Lengths of the rows; short for points, which have few images each.
 _ROW_POINT, _ROW_CAMERA, _ROW_PAIR = 4, 32, 16
 
@@ -36,6 +38,7 @@ class Groups(eqx.Module):
         order = np.append(np.argsort(group, kind="stable"), size)
         return Groups(jnp.asarray(order[members], jnp.int32), jnp.asarray(owner, jnp.int32), count)
 
+    @checked
     def sum(self, rows: Float[Array, "m f"]) -> Float[Array, "c f"]:
         """Sum of the rows of each group."""
         padded = with_zero(rows)
@@ -105,6 +108,7 @@ class Structure(eqx.Module):
         )
 
 
+@checked
 def with_zero(rows: Float[Array, "m *f"]) -> Float[Array, "n *f"]:
     """The rows and one of zeros, for empty entries of tables."""
     return jnp.concatenate([rows, jnp.zeros((1, *rows.shape[1:]), rows.dtype)])

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration.model import Intrinsics, Parametrization
@@ -34,6 +35,7 @@ class Calibrated(eqx.Module):
 
 
 @eqx.filter_jit
+@checked
 def calibrate(
     board: Float[Array, "corners 3"],
     corners: Float[Array, "boards corners 2"],
@@ -112,9 +114,11 @@ def check_corners(board: Array, *images: Array) -> None:
     """Checks that images show the corners of the board.
 
     Raises:
-        ValueError: if the numbers of corners differ.
+        ValueError: if the numbers of corners differ, or there are no images.
     """
     for corners in images:
+        if not corners.size:
+            raise ValueError(f"Calibration needs images with corners; their array has shape {corners.shape}.")
         if corners.shape[1] != board.shape[0]:
             raise ValueError(
                 f"The board has {board.shape[0]} corners, the images {corners.shape[1]}: give every image all "

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.sensors import BrownConrady, KannalaBrandt, Pinhole
 from jaxloc.sensors.lenses import Lens
@@ -42,6 +43,7 @@ class NoLens(LensModel):
         """No coefficients."""
         return ()
 
+    @checked
     def make(self, coefficients: Float[Array, " c"]) -> Lens | None:
         """No lens."""
         del coefficients
@@ -72,6 +74,7 @@ class BrownConradyModel(LensModel):
         radial = tuple(f"k{i + 1}" for i in range(self.radial))
         return tuple(n for n in self.names() if n in radial or (self.tangential and n[0] == "p"))
 
+    @checked
     def make(self, coefficients: Float[Array, " c"]) -> Lens | None:
         """The lens with these coefficients."""
         return BrownConrady(coefficients)
@@ -98,6 +101,7 @@ class Fisheye(LensModel):
         """The first ones."""
         return self.names()[: self.radial]
 
+    @checked
     def make(self, coefficients: Float[Array, " c"]) -> Lens | None:
         """The lens with these coefficients."""
         return KannalaBrandt(coefficients)
@@ -154,6 +158,7 @@ class Parametrization(eqx.Module):
     scale: Float[Array, ""]
 
     @staticmethod
+    @checked
     def of(intrinsics: Intrinsics, center: Float[Array, "2"], scale: Float[Array, ""]) -> "Parametrization":
         """Of images with this center (px), and this extent from it (px)."""
         offset = jnp.zeros(len(intrinsics.names()), center.dtype).at[2:4].set(center)
@@ -170,11 +175,13 @@ class Parametrization(eqx.Module):
         units = jnp.where(jnp.asarray(pixels), self.scale, 1.0)
         return jnp.asarray(pattern, self.scale.dtype) * units[:, None]
 
+    @checked
     def camera(self, unknowns: Float[Array, " u"]) -> Pinhole:
         """The camera."""
         values = self.offset + matmul(self.basis(), unknowns)
         return Pinhole(*(values[i] for i in range(5)), self.intrinsics.lens.make(values[5:]))
 
+    @checked
     def initial(self, focal: Float[Array, "2"], center: Float[Array, "2"]) -> Float[Array, " u"]:
         """Unknowns of a camera without lens distortion."""
         fx, fy = focal[0] / self.scale, focal[1] / self.scale

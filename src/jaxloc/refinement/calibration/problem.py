@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, retract, tangent_dimension
 from jaxloc.refinement.calibration.model import Parametrization
@@ -81,6 +82,7 @@ class BoardProblem(Problem):
     def is_valid(self, shared: Any) -> Bool[Array, ""]:
         """Whether the shared unknowns are a valid camera."""
 
+    @checked
     def one(self, shared: Any, pose: SE3, pixels: Float[Array, "2 k"], valid: Bool[Array, " k"]) -> tuple[Array, Array]:
         """Residual of one board."""
         predicted, in_front = self.predict(shared, pose)
@@ -152,6 +154,7 @@ class CameraProblem(BoardProblem):
     sigma: Float[Array, ""]
     loss: Any = Quadratic()
 
+    @checked
     def predict(self, shared: Any, pose: SE3) -> tuple[Float[Array, "2 m"], Bool[Array, " m"]]:
         """Pixels of the corners of one board, and which are in front of the camera."""
         return project(self.parametrization.camera(shared), pose, self.board)
@@ -177,6 +180,7 @@ class StereoProblem(BoardProblem):
     sigma: Float[Array, ""]
     loss: Any = Quadratic()
 
+    @checked
     def predict(self, shared: Any, pose: SE3) -> tuple[Float[Array, "2 k"], Bool[Array, " k"]]:
         """Pixels of the corners of one board, and which are in front of the cameras."""
         in_left, in_front = project(self.left.camera(shared.left), pose, self.board)
@@ -194,6 +198,7 @@ class StereoProblem(BoardProblem):
         return _positive(self.left.camera(shared.left)) & _positive(self.right.camera(shared.right))
 
 
+@checked
 def project(camera: Pinhole, pose: SE3, board: Float[Array, "3 m"]) -> tuple[Float[Array, "2 m"], Bool[Array, " m"]]:
     """Pixels of points of a board at ``T_camera_board``, and which are in front of the camera."""
     moved = matmul(pose.rotation.matrix(), board) + pose.translation[:, None]
@@ -203,6 +208,7 @@ def project(camera: Pinhole, pose: SE3, board: Float[Array, "3 m"]) -> tuple[Flo
     return jnp.stack(camera.project_components(x, y, depth)), in_front
 
 
+@checked
 def has_tilts(boards: SE3, valid: Bool[Array, "n k"]) -> Bool[Array, ""]:
     """Whether the boards are not all parallel."""
     used = jnp.any(valid, axis=1)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc import _linalg
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3
 from jaxloc.refinement.calibration.camera import check_corners, fit, prepare, transform_estimate
@@ -47,6 +48,7 @@ class CalibratedStereo(eqx.Module):
 
 
 @eqx.filter_jit
+@checked
 def calibrate_stereo(
     board: Float[Array, "corners 3"],
     left: Corners,

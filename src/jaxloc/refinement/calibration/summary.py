@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration.problem import project
 from jaxloc.refinement.calibration.zhang import finite_views
@@ -49,6 +50,7 @@ class Errors(eqx.Module):
     rms: Float[Array, ""]
 
 
+@checked
 def camera_names(camera: Pinhole) -> tuple[str, ...]:
     """Names of the components of a camera's tangent.
 
@@ -62,6 +64,7 @@ def camera_names(camera: Pinhole) -> tuple[str, ...]:
     return ("fx", "fy", "cx", "cy", "skew", *names[:size])
 
 
+@checked
 def camera_parameters(estimate: Estimate, which: int = 0) -> Parameters:
     """The parameters of a camera of a calibration.
 
@@ -82,6 +85,7 @@ def camera_parameters(estimate: Estimate, which: int = 0) -> Parameters:
 
 
 @eqx.filter_jit
+@checked
 def board_errors(
     camera: Pinhole,
     T_camera_board: SE3,

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc import _linalg
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.multiview.homography import direct_linear_transform
 from jaxloc.poses import SE3, SO3
@@ -49,6 +50,7 @@ class InitialCalibration(NamedTuple):
     boards: SE3
 
 
+@checked
 def finite_views(board: Float[Array, "m 3"], corners: Float[Array, "n m 2"], valid: Bool[Array, "n m"] | None) -> Views:
     """The views with non-finite corners masked and replaced."""
     finite = jnp.all(jnp.isfinite(corners), axis=2) & jnp.all(jnp.isfinite(board), axis=1)[None, :]
@@ -72,6 +74,7 @@ def extent(views: Views, shape: tuple[int, int] | None) -> tuple[Float[Array, "2
     return 0.5 * (low + high), jnp.maximum(0.5 * jnp.max(high - low), 1.0)
 
 
+@checked
 def closed_form(views: Views, center: Float[Array, "2"], scale: Float[Array, ""]) -> InitialCalibration:
     """The best of three closed forms, by reprojection error.
 
@@ -175,6 +178,7 @@ def _pose(matrix: Float[Array, "3 3"], focal: Float[Array, "2"], center: Float[A
     return SE3(SO3(turned), jnp.where(good, h[:, 2], 0.0))
 
 
+@checked
 def center_rows(matrix: Float[Array, "3 3"], center: Float[Array, "2"]) -> Float[Array, "3 3"]:
     """Rows of a homography relative to a principal point."""
     return jnp.concatenate([center[:, None] * matrix[2:], jnp.zeros((1, 3), matrix.dtype)])

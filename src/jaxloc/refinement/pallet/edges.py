@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._arguments import checked
 from jaxloc.images.gradients import central_difference, smooth
 from jaxloc.images.interpolation import sample
 from jaxloc.images.normalization import as_gray
@@ -43,6 +44,7 @@ class LevelView(eqx.Module):
     middle: Float[Array, "2"]
     height: Float[Array, ""]
 
+    @checked
     def rows(self, level: Float[Array, "*n"], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Rows of points at a height above the ground (m) and a distance (m)."""
         return self.middle[1] + self.focal * (self.height - level) / x
@@ -128,11 +130,13 @@ def _principal(image: Float[Array, "h w"], inside: Bool[Array, "h w"]) -> Float[
     return jnp.where(whole & (jnp.abs(slope.right) >= jnp.abs(slope.down)), slope.right, 0.0)
 
 
+@checked
 def summed(slope: Float[Array, "h w"]) -> Float[Array, "h1 w"]:
     """Cumulative sums of rows: the mean over any band is the difference of two."""
     return jnp.concatenate([jnp.zeros_like(slope[:1]), jnp.cumsum(slope, axis=0)])
 
 
+@checked
 def band_profile(sums: Float[Array, "h1 w"], top: Float[Array, ""], bottom: Float[Array, ""]) -> Float[Array, " w"]:
     """Mean of each column between two rows, with fractions of rows; zero for bands outside the image."""
     high, low = (jnp.clip(row + 0.5, 0.0, sums.shape[0] - 1.0) for row in (top, bottom))
@@ -148,6 +152,7 @@ def band_profile(sums: Float[Array, "h1 w"], top: Float[Array, ""], bottom: Floa
     return jnp.where(inside, (upto(low) - upto(high)) / length, 0.0)
 
 
+@checked
 def hole_band(view: LevelView, kind: PalletType, x: Float[Array, ""]) -> Float[Array, "2"]:
     """First and last row of the inner part of the holes of a pallet at a distance."""
     middle = kind.hole_bottom + 0.5 * kind.hole_height
@@ -155,6 +160,7 @@ def hole_band(view: LevelView, kind: PalletType, x: Float[Array, ""]) -> Float[A
     return jnp.stack([view.rows(middle + half, x), view.rows(middle - half, x)])
 
 
+@checked
 def strongest_edges(profile: Float[Array, " w"], count: int) -> Peaks:
     """The highest peaks of a profile, refined by a parabola through the logarithms of three columns.
 
@@ -170,9 +176,16 @@ def strongest_edges(profile: Float[Array, " w"], count: int) -> Peaks:
     return Peaks(jnp.where(found, _vertex(height, index), 0.0), jnp.where(found, strength, 0.0))
 
 
+@checked
 def peak_near(profile: Float[Array, " w"], column: Float[Array, ""], radius: int) -> Peaks:
-    """The highest peak of a profile within some pixels of a column, as a set of one."""
+    """The highest peak of a profile within some pixels of a column, as a set of one.
+
+    Raises:
+        ValueError: a profile without pixels.
+    """
     width = profile.shape[0]
+    if not width:
+        raise ValueError("peak_near: a profile without pixels.")
     places = jnp.arange(width, dtype=profile.dtype)
     near = jnp.abs(places - lax.stop_gradient(column)) <= radius
     index = jnp.argmax(lax.stop_gradient(jnp.where(near, profile, -jnp.inf)))
@@ -196,6 +209,7 @@ def _vertex(height: Float[Array, " w2"], index: Int[Array, " k"]) -> Float[Array
     return index.astype(height.dtype) + jnp.clip(shift, -1.0, 1.0)
 
 
+@checked
 def best_candidate(profile: Float[Array, " w"], kind: PalletType, span: Float[Array, ""], count: int) -> Candidate:
     """The four edges that fit a kind of pallet with the greatest strength of the weakest edge [K-74].
 
@@ -231,6 +245,7 @@ def best_candidate(profile: Float[Array, " w"], kind: PalletType, span: Float[Ar
     return Candidate(jnp.stack(columns), jnp.max(score))
 
 
+@checked
 def edges_along(
     view: LevelView, sums: Float[Array, "h1 w"], kind: PalletType, columns: Float[Array, "4"], x: Float[Array, "4"]
 ) -> MeasuredEdges:

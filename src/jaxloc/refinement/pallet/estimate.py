@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, Num
 
+from jaxloc._arguments import checked
 from jaxloc.poses import SE2
 from jaxloc.refinement.pallet.edges import (
     LevelView,
@@ -78,6 +79,7 @@ class _Proposal(eqx.Module):
 
 
 @eqx.filter_jit
+@checked
 def find_pallet(
     image: Num[Array, "h w"],
     camera: GroundCamera,
@@ -115,6 +117,7 @@ def find_pallet(
 
 
 @eqx.filter_jit
+@checked
 def detect_pallet(
     image: Num[Array, "h w"],
     camera: GroundCamera,

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._arguments import checked
 from jaxloc.images.interpolation import sample
 from jaxloc.images.normalization import standardize
 from jaxloc.poses import SE2
@@ -16,6 +17,7 @@ _MARGIN = 1.08  # width of the template over that of the face, to include the ba
 
 
 @eqx.filter_jit
+@checked
 def face_template(kind: PalletType) -> Float[Array, "24 128"]:
     """Template of the front of a pallet: one for wood, zero in the holes and beside the face.
 
@@ -33,6 +35,7 @@ def face_template(kind: PalletType) -> Float[Array, "24 128"]:
 
 
 @eqx.filter_jit
+@checked
 def view_face(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, "24 128"]:
     """The image at the face of a pallet with a given pose, sampled along the face.
 
@@ -57,6 +60,7 @@ def view_face(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, "24 
 
 
 @eqx.filter_jit
+@checked
 def type_correlation(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, ""]:
     """Normalized correlation of the image at a pose with the template of a kind.
 
@@ -81,6 +85,7 @@ def type_correlation(view: LevelView, kind: PalletType, pose: SE2) -> Float[Arra
 
 
 @eqx.filter_jit
+@checked
 def correlate_types(view: LevelView, kinds: PalletType, pose: SE2) -> Float[Array, " m"]:
     """`type_correlation` with each kind of a bank at one pose.
 

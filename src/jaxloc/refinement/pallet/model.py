@@ -15,6 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE2
 from jaxloc.poses.lie_group import as_floats
@@ -80,6 +81,7 @@ def block_narrow() -> PalletType:
     return PalletType(0.25, 0.3, face_width=1.0)
 
 
+@checked
 def hole_ratio(bearings: Float[Array, "4"]) -> Float[Array, ""]:
     """Mean width of the holes over their separation in the image; independent of range for a frontal view.
 
@@ -104,6 +106,7 @@ def hole_ratio(bearings: Float[Array, "4"]) -> Float[Array, ""]:
     )
 
 
+@checked
 def cross_ratio(bearings: Float[Array, "4"]) -> Float[Array, ""]:
     """``(a - c)(b - d) / ((b - c)(a - d))``: invariant to the pose; zero where undefined.
 
@@ -119,6 +122,7 @@ def cross_ratio(bearings: Float[Array, "4"]) -> Float[Array, ""]:
 
 
 @eqx.filter_jit
+@checked
 def edge_bearings(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[Array, " n"]:
     """Bearings of vertical edges of a pallet in the image: ``y_i = f y / x`` px left of the principal column [K-76].
 
@@ -141,6 +145,7 @@ def edge_bearings(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[Arr
 
 
 @eqx.filter_jit
+@checked
 def printed_jacobian(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[Array, "3 n"]:
     """Derivative of the bearings by the pallet's (x, y, heading) as printed in the lecture, edges last.
 
@@ -207,6 +212,7 @@ class PalletEdges(Problem):
 
 
 @eqx.filter_jit
+@checked
 def pose_from_edges(
     kind: PalletType,
     bearings: Float[Array, "4"],

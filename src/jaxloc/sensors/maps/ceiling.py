@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc.beliefs import Sensor
 from jaxloc.beliefs.models import innovation
 from jaxloc.images.interpolation import Sampled, sample
@@ -45,6 +46,7 @@ class CeilingMosaic(eqx.Module):
         rows, columns = self.brightness.shape
         return self.origin + self.resolution * jnp.array([columns - 1, rows - 1], self.origin.dtype)
 
+    @checked
     def at(self, points: Float[Array, "n 2"]) -> Sampled:
         """Brightness above points of the floor (m), bilinear; zero outside the mosaic."""
         return sample(self.brightness, (points - self.origin[None, :]) / self.resolution)
@@ -95,14 +97,17 @@ class CeilingSensor(Sensor):
         self.outlier = jnp.asarray(outlier, dtype)
         self.mount = jnp.zeros(2, dtype) if mount is None else mount
 
+    @checked
     def expect(self, state: SE2, measurement: Float[Array, ""]) -> Float[Array, ""]:
         """Brightness of the mosaic above the camera."""
         return self._sample(state).values[0]
 
+    @checked
     def covariance(self, state: SE2, measurement: Float[Array, ""]) -> Float[Array, "1 1"]:
         """Variance of readings that are not outliers."""
         return (self.standard_deviation**2)[None, None]
 
+    @checked
     def log_prob(self, state: SE2, measurement: Float[Array, ""], valid: Bool[Array, "*m"]) -> Float[Array, ""]:
         """Log density of a reading; outside the mosaic a low constant, so that particles there lose their weight."""
         seen = self._sample(state)

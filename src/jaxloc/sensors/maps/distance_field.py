@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc.poses import SE2
 from jaxloc.sensors.maps.occupancy_map import OccupancyMap
 
@@ -41,6 +42,7 @@ class DistanceField(eqx.Module):
 
     @staticmethod
     @eqx.filter_jit
+    @checked
     def of(grid: OccupancyMap, *, ceiling: float | Float[Array, ""] = 2.0, surfaces: bool = False) -> "DistanceField":
         """The exact Euclidean field of the occupied cells of a map.
 
@@ -57,6 +59,7 @@ class DistanceField(eqx.Module):
         cells = jnp.sqrt(squared_distances(obstacles, dtype=dtype))
         return DistanceField(jnp.minimum(cells * grid.resolution, ceiling), grid.resolution, grid.origin, ceiling)
 
+    @checked
     def to_grid(self, pose: SE2, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> tuple[Array, Array]:
         """Grid coordinates (column, row) of points in the frame of a pose in the world.
 
@@ -67,6 +70,7 @@ class DistanceField(eqx.Module):
         shift = local.translation / self.resolution - 0.5
         return shift[0] + (cos * x - sin * y), shift[1] + (sin * x + cos * y)
 
+    @checked
     def lookup(self, u: Float[Array, "*n"], v: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Distances (m) at finite grid coordinates (column u, row v), bilinear."""
         rows, columns = self.distance.shape
@@ -83,6 +87,7 @@ class DistanceField(eqx.Module):
         inside = (1.0 - b) * (low + a * (low_right - low)) + b * (high + a * (high_right - high))
         return jnp.minimum(inside + self._beyond(u - u_in, v - v_in), self.ceiling)
 
+    @checked
     def at(self, points: Float[Array, "n 2"]) -> Float[Array, " n"]:
         """Distances (m) at points of the world (m); the ceiling at non-finite points."""
         finite = jnp.all(jnp.isfinite(points), axis=1)
@@ -98,6 +103,7 @@ class DistanceField(eqx.Module):
 
 
 @eqx.filter_jit
+@checked
 def squared_distances(
     occupied: Bool[Array, "rows columns"], *, dtype: Any = jnp.float32
 ) -> Float[Array, "rows columns"]:
@@ -142,6 +148,7 @@ def squared_distances(
 
 
 @eqx.filter_jit
+@checked
 def trace(
     field: DistanceField,
     pose: SE2,

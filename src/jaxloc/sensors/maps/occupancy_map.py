@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._arguments import checked
 from jaxloc.poses import SE2
 
 _GOLDEN = 0.6180339887498949
@@ -80,10 +81,12 @@ class OccupancyMap(eqx.Module):
         found = self.occupied & beside
         return jnp.where(jnp.any(found), found, self.occupied)
 
+    @checked
     def to_cells(self, points: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
         """Grid coordinates (column, row), centers of cells at integers, of points of the world (m)."""
         return self.origin.inverse().apply(points) / self.resolution - 0.5
 
+    @checked
     def to_world(self, cells: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
         """Points of the world (m) of grid coordinates (column, row)."""
         return self.origin.apply((cells + 0.5) * self.resolution)
@@ -118,6 +121,7 @@ class FreeSpace(eqx.Module):
         """Area of the free cells, m^2."""
         return self.cells.shape[0] * self.resolution**2
 
+    @checked
     def sample_evenly(self, num_poses: int, *, key: Key[Array, ""]) -> SE2:
         """Poses evenly distributed over the free cells and all headings, with one random shift of the pattern.
 
@@ -134,6 +138,7 @@ class FreeSpace(eqx.Module):
         turn = jnp.asarray(np.arange(num_poses) * _GOLDEN % 1.0, dtype)
         return self._poses(index, 2.0 * jnp.pi * (turn + offset[1]), within)
 
+    @checked
     def sample(self, num_poses: int, *, key: Key[Array, ""]) -> SE2:
         """Independent poses, uniform over the free cells and all headings."""
         place, heading, within = jax.random.split(key, 3)

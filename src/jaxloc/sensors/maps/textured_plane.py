@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
 from jaxloc.images.interpolation import AbstractInterpolation, Bilinear, sample
 from jaxloc.images.warps import Homography
@@ -52,11 +53,13 @@ class TexturedPlane(eqx.Module):
         self.resolution = jnp.asarray(resolution, texture.dtype)
         self.T_world_plane = T_world_plane
 
+    @checked
     def points(self, pixels: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
         """Points of the world (m) of pixels of the map (right, down)."""
         flat = jnp.concatenate([pixels * self.resolution, jnp.zeros_like(pixels[:, :1])], axis=1)
         return self.T_world_plane.apply(flat)
 
+    @checked
     def homography(self, camera: Pinhole, T_world_camera: SE3) -> Homography:
         """Homography from pixels of the map to pixels of a camera without a lens: ``K [r1 r2 t] diag(s, s, 1)`` [K-17].
 
@@ -70,6 +73,7 @@ class TexturedPlane(eqx.Module):
         return Homography.from_matrix(matmul(camera.matrix(), columns))
 
     @eqx.filter_jit
+    @checked
     def predict(
         self,
         camera: Pinhole,

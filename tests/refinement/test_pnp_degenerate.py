@@ -1,0 +1,83 @@
+"""Points near a line or a plane, seen frontally and from far: refused or accepted alike in both precisions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxloc.poses import SE3
+from jaxloc.refinement import refine_pose
+from jaxloc.sensors import Pinhole
+
+COUNT, SIGMA, DRAWS = 20, 0.3, 8
+
+
+def points_of(rng, kind, width):
+    """Points about the origin, half a meter wide: in a volume, near a plane (z = 0), near a line."""
+    points = rng.uniform(-0.25, 0.25, (COUNT, 3))
+    if kind == "plane":
+        points[:, 2] *= width
+    elif kind == "line":
+        axis, start = rng.standard_normal((2, 3))
+        along = np.linspace(-0.4, 0.4, COUNT)[:, None] * axis / np.linalg.norm(axis)
+        points = 0.1 * start + along + width * rng.standard_normal((COUNT, 3))
+    return points
+
+
+def fits(kind, width, tilt, distance, wide):
+    """Estimates of all draws, from the true pose, in one of the precisions; and the true poses."""
+    rng = np.random.default_rng(5)
+    points = np.stack([points_of(rng, kind, width) for _ in range(DRAWS)])
+    noise = SIGMA * rng.standard_normal((DRAWS, COUNT, 2))
+    with jax.enable_x64(wide):
+        dtype = jnp.float64 if wide else jnp.float32
+        camera = Pinhole(*(jnp.asarray(x, dtype) for x in (800.0, 800.0, 320.0, 240.0)))
+        turn = SE3.exp(jnp.array([0.0, 0.0, 0.0, np.radians(tilt), 0.0, 0.0], dtype)).rotation
+        pose = SE3(turn, jnp.array([0.05, 0.02, distance], dtype)).inverse()
+
+        def one(points, noise):
+            pixels = camera.project(pose.inverse().apply(points)) + noise
+            return refine_pose(camera, points, pixels, pose, sigma=SIGMA)
+
+        found = jax.jit(jax.vmap(one))(jnp.asarray(points, dtype), jnp.asarray(noise, dtype))
+        errors = jax.vmap(lambda value: pose.local(value))(found.value)
+        return jax.tree.map(np.asarray, (found.ok, found.covariance, errors))
+
+
+CASES = [
+    ("volume", 1.0, 0.0, 3.0, True),
+    ("plane", 0.1, 0.0, 3.0, True),
+    ("plane", 0.0, 30.0, 3.0, True),
+    ("plane", 0.0, 0.0, 1.0, True),
+    ("plane", 0.0, 0.0, 8.0, True),
+    ("plane", 1e-3, 0.0, 20.0, True),
+    ("line", 0.1, 20.0, 5.0, True),
+    ("line", 1e-2, 20.0, 5.0, True),
+    ("line", 1e-4, 20.0, 5.0, False),
+    ("line", 0.0, 20.0, 5.0, False),
+    ("line", 0.0, 0.0, 20.0, False),
+]
+
+
+@pytest.mark.parametrize("kind, width, tilt, distance, expected", CASES)
+def test_both_precisions_agree(kind, width, tilt, distance, expected):
+    (ok, covariance, errors), (ok_wide, covariance_wide, errors_wide) = (
+        fits(kind, width, tilt, distance, wide) for wide in (False, True)
+    )
+    assert ok.tolist() == ok_wide.tolist() == [expected] * DRAWS
+    assert np.isfinite(covariance).all() and np.isfinite(errors).all()
+    if expected:
+        sigma, sigma_wide = (np.sqrt(np.diagonal(c, axis1=1, axis2=2)) for c in (covariance, covariance_wide))
+        np.testing.assert_allclose(sigma, sigma_wide, rtol=0.05)
+        # Rounding moves the pose by far less than its noise.
+        assert (np.abs(errors - errors_wide) < 0.2 * sigma_wide).all()
+
+
+def test_a_refused_pose_has_no_gradient():
+    rng = np.random.default_rng(0)
+    camera, pose = Pinhole(800.0, 800.0, 320.0, 240.0), SE3.identity()
+    points = jnp.asarray(points_of(rng, "line", 0.0) + [0.0, 0.0, 5.0], jnp.float32)
+    pixels = camera.project(points)
+    fit = refine_pose(camera, points, pixels, pose, sigma=SIGMA)
+    slope = jax.grad(lambda z: jnp.sum(refine_pose(camera, points, z, pose, sigma=SIGMA).value.translation))(pixels)
+    assert not bool(fit.ok) and not np.asarray(slope).any()
