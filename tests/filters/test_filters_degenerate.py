@@ -71,7 +71,7 @@ BASE = {
     "valid": jnp.array(True),
 }
 UNSUPPORTED = lanes.unusable("mean", "cov") | {"cov=-1", "cov indefinite"}
-SLOW = {*GAUSSIAN, *PROPOSALS} - {"KalmanFilter, gate", "InformationFilter"}
+SLOW = {*GAUSSIAN, *PROPOSALS} - {"KalmanFilter, gate"}
 
 
 def test_every_filter_is_here():

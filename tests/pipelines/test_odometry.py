@@ -61,6 +61,7 @@ def test_older_keyframes_give_the_same_path(street):
     assert np.allclose(motions, relative(matrices(outs)), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_dark_frames_are_predicted_with_grown_covariance_and_then_bridged(street):
     sequence, truth = street
     frames = [sequence[i] for i in range(len(sequence))]
