@@ -24,6 +24,18 @@ def points_of(rng, kind, width):
     return points
 
 
+@jax.jit
+def fits_of(camera, pose, points, noise):
+    """Estimates of all draws, and the errors of their poses: one program a precision."""
+
+    def one(points, noise):
+        pixels = camera.project(pose.inverse().apply(points)) + noise
+        return refine_pose(camera, points, pixels, pose, sigma=SIGMA)
+
+    found = jax.vmap(one)(points, noise)
+    return found.ok, found.covariance, jax.vmap(lambda value: pose.local(value))(found.value)
+
+
 def fits(kind, width, tilt, distance, wide):
     """Estimates of all draws, from the true pose, in one of the precisions; and the true poses."""
     rng = np.random.default_rng(5)
@@ -34,14 +46,7 @@ def fits(kind, width, tilt, distance, wide):
         camera = Pinhole(*(jnp.asarray(x, dtype) for x in (800.0, 800.0, 320.0, 240.0)))
         turn = SE3.exp(jnp.array([0.0, 0.0, 0.0, np.radians(tilt), 0.0, 0.0], dtype)).rotation
         pose = SE3(turn, jnp.array([0.05, 0.02, distance], dtype)).inverse()
-
-        def one(points, noise):
-            pixels = camera.project(pose.inverse().apply(points)) + noise
-            return refine_pose(camera, points, pixels, pose, sigma=SIGMA)
-
-        found = jax.jit(jax.vmap(one))(jnp.asarray(points, dtype), jnp.asarray(noise, dtype))
-        errors = jax.vmap(lambda value: pose.local(value))(found.value)
-        return jax.tree.map(np.asarray, (found.ok, found.covariance, errors))
+        return jax.tree.map(np.asarray, fits_of(camera, pose, jnp.asarray(points, dtype), jnp.asarray(noise, dtype)))
 
 
 CASES = [

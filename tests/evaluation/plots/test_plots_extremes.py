@@ -90,7 +90,11 @@ def test_every_figure_is_here():
     assert set(ARGUMENTS) == {name for name in plots.__all__ if name.startswith("draw_")}
 
 
-@pytest.mark.parametrize("values", VALUES)
+QUICK = ("both signs", "empty", "missing")
+CASES = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in VALUES]
+
+
+@pytest.mark.parametrize("values", CASES)
 @pytest.mark.parametrize("name", ARGUMENTS)
 def test_it_can_be_drawn(name, values):
     figure = rendered(getattr(plots, name)(*ARGUMENTS[name](np.array(VALUES[values]))))
