@@ -27,9 +27,15 @@ jax.config.update("jax_traceback_in_locations_limit", 0)
 gc.set_threshold(100_000, 20, 100)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Recordings are no part of the project (their licences forbid it): tests that read them run where they lie."""
+    """Examples of docstrings are slow together: three minutes of programs that run once.
+
+    Recordings are no part of the project (their licences forbid it): tests that read them run where they lie.
+    """
     for item in items:
+        if isinstance(item, pytest.DoctestItem):
+            item.add_marker(pytest.mark.slow)
         if item.get_closest_marker("recordings") and not RECORDINGS.is_dir():
             item.add_marker(pytest.mark.skip(reason=f"the recordings are not at {RECORDINGS}"))
 

@@ -54,6 +54,7 @@ def test_the_true_pose_is_among_the_candidates(dtype, batch):
     assert (best < (1e-6 if dtype == np.float64 else 1e-2)).mean() > (0.99 if dtype == np.float64 else 0.9)
 
 
+@pytest.mark.slow
 def test_solutions_equal_poselib(x64, batch):
     first, second, _, _ = problems(seed=1)
     found = batch(jnp.asarray(first), jnp.asarray(second))

@@ -166,6 +166,7 @@ def test_scale_is_free(x64):  # K-88
     np.testing.assert_allclose(seen[0], seen[1], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_inliers_are_a_mask_over_the_given_pairs(x64):
     """1 % of true pairs lie beyond the gate; a false pair lies within by chance."""
     first, second, _, _ = pairs(5)

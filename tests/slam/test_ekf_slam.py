@@ -77,6 +77,7 @@ def test_landmarks_are_consistent(drives, x64):
     assert float(nees.mean()) == pytest.approx(2.0, abs=1.96 * np.sqrt(4 / NUM_RUNS))
 
 
+@pytest.mark.slow
 def test_unknown_numbers_are_found(drives, x64):
     worlds, (known, _), (guessed, history) = drives
     count = np.asarray(guessed.seen.sum(axis=1))

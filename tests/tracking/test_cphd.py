@@ -215,6 +215,7 @@ def test_targets_in_sight_are_counted_and_never_share_a_label():
         assert len(set(labels[there])) == there.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_likelihood_has_the_gradient_of_finite_differences(rng):
     z, valid = jnp.asarray(rng.normal(scale=3.0, size=(4, 2))), jnp.ones(4, bool)

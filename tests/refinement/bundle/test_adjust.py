@@ -241,6 +241,7 @@ def test_pose_errors_agree_with_their_covariance(x64, rng):
     assert 5.2 < mean < 6.8
 
 
+@pytest.mark.slow
 def test_covariance_of_a_robust_bundle_equals_the_sandwich(x64, rng):
     """Dense, by autodiff of each observation's cost; leverage by the points alone, as documented."""
     rig, loss = rig_at(), Cauchy(2.0)

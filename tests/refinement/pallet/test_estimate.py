@@ -71,6 +71,7 @@ def test_lens_pitch_and_shading(rng):
     assert bool(found.estimate.ok) and away < 0.01 and turned < 0.5
 
 
+@pytest.mark.slow
 def test_ratio_of_found_edges_is_constant_over_range():  # K-74
     ratios = []
     for x in (1.3, 2.0, 3.0, 3.8):

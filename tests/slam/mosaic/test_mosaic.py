@@ -129,6 +129,7 @@ def test_poses_from_features(x64, rng):
     assert not bool(mosaic.pose_from_features(seen, points, truth, valid=jnp.arange(12) < 1).ok)
 
 
+@pytest.mark.slow
 def test_registration_is_exact_to_a_twentieth_of_a_pixel(drive, patches):
     squared = []
     for number in range(5):
