@@ -27,6 +27,22 @@ def test_the_condition_is_not_squared(x64):
     np.testing.assert_allclose(solve(rows, rows @ jnp.array([1.0, 2.0])), [1.0, 2.0], rtol=1e-6)
 
 
+def test_pytrees(rng, x64):
+    """Rows and unknowns in several arrays, as a damped step has them."""
+    parts = {"a": jnp.asarray(rng.normal(size=(7, 2, 2))), "b": jnp.asarray(rng.normal(size=(7, 3)))}
+
+    def call(x):
+        value = jnp.einsum("mij,ij->m", parts["a"], x["a"]) + parts["b"] @ x["b"]
+        return value[:3], value[3:]
+
+    truth = {"a": jnp.arange(4.0).reshape(2, 2), "b": jnp.arange(3.0)}
+    operator = lx.FunctionLinearOperator(call, jax.eval_shape(lambda: truth))
+    found = lx.linear_solve(operator, call(truth), QR()).value
+    assert found.keys() == truth.keys()
+    np.testing.assert_allclose(found["a"], truth["a"], atol=1e-12)
+    np.testing.assert_allclose(found["b"], truth["b"], atol=1e-12)
+
+
 @pytest.mark.parametrize("rows", [jnp.zeros((4, 2)), jnp.ones((1, 2))])
 def test_deficient_systems_have_no_finite_solution(rows):
     assert not jnp.isfinite(solve(rows, jnp.ones(rows.shape[0]))).all()

@@ -109,7 +109,7 @@ def initiate(model: TargetModel, tracks: Tracks, measurements: Any, present: Boo
         nothing = jnp.zeros((), tracks.existence.dtype)
         return NewTargets(states, jnp.full((num,), -jnp.inf, nothing.dtype), nothing)
     intensity = jax.vmap(model.birth.log_intensity)(measurements)
-    seeds = jax.vmap(model.birth.seed)(measurements)
+    seeds: Any = jax.vmap(model.birth.seed)(measurements)  # not None, since there is an intensity
     good = present & jax.vmap(validity.usable)(seeds.mean, seeds.covariance)
     states = jax.vmap(model.filter.init)(seeds)
     return NewTargets(states, jnp.where(good, intensity, -jnp.inf), model.birth.rate)
