@@ -78,6 +78,26 @@ def test_both_precisions_agree(kind, width, tilt, distance, expected):
         assert (np.abs(errors - errors_wide) < 0.2 * sigma_wide).all()
 
 
+@pytest.mark.parametrize("far", [1e3, 1e5, 1e9])
+def test_a_point_at_the_horizon_costs_no_precision(far):
+    rng = np.random.default_rng(0)
+    points = np.vstack([[*rng.uniform(-2.0, 2.0, (COUNT - 1, 3)) + [0.0, 0.0, 6.0]], [[0.1 * far, 0.05 * far, far]]])
+    found = []
+    for wide in (False, True):
+        with jax.enable_x64(wide):
+            dtype = jnp.float64 if wide else jnp.float32
+            camera = Pinhole(*(jnp.asarray(x, dtype) for x in (800.0, 800.0, 320.0, 240.0)))
+            pose = SE3.exp(jnp.array([0.1, 0.2, -0.1, 0.05, 0.02, 0.1], dtype))
+            noise = jnp.asarray(SIGMA * np.random.default_rng(1).standard_normal((DRAWS, COUNT, 2)), dtype)
+            many = jnp.broadcast_to(jnp.asarray(points, dtype), (DRAWS, COUNT, 3))
+            found.append(jax.tree.map(np.asarray, fits_of(camera, pose, many, noise)))
+    (ok, covariance, errors), (ok_wide, covariance_wide, errors_wide) = found
+    assert ok.all() and ok_wide.all()
+    sigma = np.sqrt(np.diagonal(covariance_wide, axis1=1, axis2=2))
+    np.testing.assert_allclose(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), sigma, rtol=0.01)
+    assert (np.abs(errors - errors_wide) < 0.05 * sigma).all()
+
+
 def test_a_refused_pose_has_no_gradient():
     rng = np.random.default_rng(0)
     camera, pose = Pinhole(800.0, 800.0, 320.0, 240.0), SE3.identity()

@@ -64,17 +64,24 @@ def refine_pose(
     """
     usable, points, pixels = _usable(valid, points_world, pixels)
     sigma = jnp.asarray(sigma, pixels.dtype)
-    mean = _mean(points, usable)
+    mean = _mean(points, usable, initial)
     center = _seen_from(initial, mean)
     problem = Reprojection(camera, points.T, pixels.T, sigma, usable, loss, center)
     fit = solve(problem, _shifted(initial, center), solver=solver)
     return _refuse_vague(_about_camera(fit, center), fit.covariance, mean)
 
 
-def _mean(points: Float[Array, "n 3"], usable: Bool[Array, " n"]) -> Float[Array, "3"]:
-    """Mean of the usable points (the others are zero), without derivatives."""
-    count = jnp.maximum(jnp.sum(usable), 1).astype(points.dtype)
-    return lax.stop_gradient(jnp.sum(points, axis=0) / count)
+def _mean(points: Float[Array, "n 3"], usable: Bool[Array, " n"], pose: SE3) -> Float[Array, "3"]:
+    """Mean of the usable points (the others are zero), each by what it tells about the position; no derivatives.
+
+    That falls with the square of the distance: a point at the horizon must not draw the center there, at which single
+    precision could not tell positions of the camera apart.
+    """
+    squared = jnp.sum(lax.stop_gradient(pose.inverse().apply(points)) ** 2, axis=1)
+    floor = float(jnp.finfo(points.dtype).eps) ** 2
+    weights = jnp.where(usable & jnp.isfinite(squared), 1.0 / jnp.maximum(squared, floor), 0.0)
+    total = jnp.sum(weights)
+    return lax.stop_gradient(jnp.sum(weights[:, None] * points, axis=0) / jnp.where(total > 0.0, total, 1.0))
 
 
 def _seen_from(pose: SE3, point: Float[Array, "3"]) -> Float[Array, "3"]:
