@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
 from jaxloc._arguments import checked
-from jaxloc._linalg import matmul
+from jaxloc.beliefs.square_root import product
 from jaxloc.poses import SE3
 from jaxloc.poses.lie_group import skew
 from jaxloc.refinement.reprojection import Reprojection
@@ -77,7 +77,7 @@ def _mean(points: Float[Array, "n 3"], usable: Bool[Array, " n"], pose: SE3) -> 
     That falls with the square of the distance: a point at the horizon must not draw the center there, at which single
     precision could not tell positions of the camera apart.
     """
-    squared = jnp.sum(lax.stop_gradient(pose.inverse().apply(points)) ** 2, axis=1)
+    squared = jnp.sum(lax.stop_gradient(points - pose.translation[None, :]) ** 2, axis=1)
     floor = float(jnp.finfo(points.dtype).eps) ** 2
     weights = jnp.where(usable & jnp.isfinite(squared), 1.0 / jnp.maximum(squared, floor), 0.0)
     total = jnp.sum(weights)
@@ -101,8 +101,8 @@ def _refuse_vague(fit: Estimate, covariance: Float[Array, "6 6"], mean: Float[Ar
     Its rank depends on rounding, and so on the precision; standard deviations do not. Beyond a radian, or the distance
     of the points, the linearization means nothing. The covariance is that of the frame at the center.
     """
-    variance, distance = lax.stop_gradient(jnp.diagonal(covariance)), _seen_from(fit.value, mean)
-    vague = (jnp.sum(variance[3:]) > 1.0) | (jnp.sum(variance[:3]) > jnp.sum(distance * distance))
+    variance, offset = lax.stop_gradient((jnp.diagonal(covariance), mean - fit.value.translation))
+    vague = (jnp.sum(variance[3:]) > 1.0) | (jnp.sum(variance[:3]) > jnp.sum(offset * offset))
     ok = fit.ok & ~vague
     status = jnp.where(fit.ok & vague, int(Status.RANK_DEFICIENT), fit.status)
     found = fit.value, fit.covariance, fit.cost, fit.information
@@ -115,8 +115,8 @@ def _about_camera(fit: Estimate, center: Float[Array, "3"]) -> Estimate:
     eye, zero = jnp.eye(3, dtype=center.dtype), jnp.zeros((3, 3), center.dtype)
     turned = jnp.block([[eye, skew(center)], [zero, eye]])
     back = jnp.block([[eye, -skew(center)], [zero, eye]])
-    covariance = matmul(turned, matmul(fit.covariance, turned.T))
-    information = matmul(back.T, matmul(fit.information, back))
+    covariance = product(turned, product(fit.covariance, turned.T))
+    information = product(back.T, product(fit.information, back))
     value = _shifted(fit.value, -center)
     return Estimate(value, covariance, fit.cost, fit.ok, fit.num_steps, fit.status, information)
 
