@@ -22,6 +22,7 @@ class Status(IntEnum):
     DIVERGED = 3
     NONFINITE = 4
     INADMISSIBLE = 5
+    IMPRECISE = 6
 
 
 _MEANING = {
@@ -31,6 +32,7 @@ _MEANING = {
     Status.DIVERGED: "the cost ended above the initial one: start closer, or use LevenbergMarquardt()",
     Status.NONFINITE: "the data or the initial value hold nan or inf",
     Status.INADMISSIBLE: "the result contradicts the model, such as an observed point behind its camera",
+    Status.IMPRECISE: "rounding exceeds the stated noise: take a common offset off the coordinates, or use float64",
 }
 
 
