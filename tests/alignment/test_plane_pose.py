@@ -42,6 +42,7 @@ def test_pose_is_found_under_another_exposure(scene):
     assert float(fit.gaussian().mahalanobis_squared(truth)) < 25
 
 
+@pytest.mark.slow
 def test_covariance_is_consistent(scene):
     plane, truth, photo = scene
     rng = np.random.default_rng(2)

@@ -30,15 +30,19 @@ def motions(rig, pairs, predictions, keys):
     return jax.vmap(one)(pairs, predictions, keys)
 
 
+def simulate(num_pairs):
+    """Independent frame pairs with a quarter of outliers."""
+    rig = simulate_points.kitti_rig()
+    return rig, simulate_points.simulate_stereo_points(key=jax.random.key(5), rig=rig, num_frames=num_pairs + 1).pairs
+
+
 @pytest.fixture(scope="module")
 def drive():
-    """Motions of 240 independent frame pairs with a quarter of outliers, started at the motion before."""
-    rig = simulate_points.kitti_rig()
-    simulated = simulate_points.simulate_stereo_points(key=jax.random.key(5), rig=rig, num_frames=241)
-    truth = simulated.pairs.motion
-    before = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf[:-1]]), truth)
-    found = motions(rig, simulated.pairs, before, jax.random.split(jax.random.key(6), 240))
-    return rig, simulated.pairs, found
+    """Motions of 240 pairs, started at the motion before."""
+    rig, pairs = simulate(240)
+    before = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf[:-1]]), pairs.motion)
+    found = motions(rig, pairs, before, jax.random.split(jax.random.key(6), 240))
+    return rig, pairs, found
 
 
 @pytest.mark.slow
@@ -51,6 +55,7 @@ def test_every_motion_is_found_without_outliers_among_the_inliers(drive):
     assert float(jnp.mean(jnp.sum(missed, axis=1))) < 2.0
 
 
+@pytest.mark.slow
 def test_covariance_is_honest(drive):
     """NEES of 6 and 95 % coverage over 240 seeds."""
     _, pairs, found = drive
@@ -59,6 +64,7 @@ def test_covariance_is_honest(drive):
     assert 0.92 < float(jnp.mean(squared < chi2_quantile(0.95, 6))) < 0.98
 
 
+@pytest.mark.slow
 def test_errors_show_no_bias(drive):
     """Mean error below three standard errors of the mean in every direction."""
     _, pairs, found = drive
@@ -76,15 +82,16 @@ def test_a_prediction_that_is_far_off_is_overruled_by_samples(drive):
     assert float(jnp.max(jnp.abs(difference))) < 2e-3
 
 
-def test_without_information_there_is_no_motion_and_no_nan(drive):
+@pytest.mark.slow
+def test_without_information_there_is_no_motion_and_no_nan():
     """All points the same, no disparity, nan everywhere, ten points only: each in one lane of a batch of good ones."""
-    rig, pairs, found = drive
+    rig, pairs = simulate(8)
     previous, current = pairs.previous, pairs.current
     previous = previous.at[0].set(previous[0, :1]).at[1, :, 1].set(previous[1, :, 0]).at[2].set(jnp.nan)
     previous = previous.at[3, 10:].set(jnp.nan)
     current = current.at[0].set(current[0, :1])
     lame = eqx.tree_at(lambda p: (p.previous, p.current), pairs, (previous, current))
-    again = motions(rig, lame, pairs.motion, jax.random.split(jax.random.key(6), 240))
+    again = motions(rig, lame, pairs.motion, jax.random.split(jax.random.key(6), 8))
     assert not again.estimate.ok[:4].any() and again.estimate.ok[4:].all()
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(eqx.filter(again, eqx.is_inexact_array)))
 

@@ -77,6 +77,7 @@ def test_dark_frames_are_predicted_with_grown_covariance_and_then_bridged(street
     assert all(np.isfinite(out.covariance).all() for out in outs)
 
 
+@pytest.mark.slow
 def test_a_recording_that_stays_dark_still_gives_poses(street):
     sequence, _ = street
     frame = sequence[0]

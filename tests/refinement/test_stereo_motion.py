@@ -80,6 +80,7 @@ def test_motion_masked_equals_absent(x64, rng):
     np.testing.assert_allclose(each.value.matrix(), alike.value.matrix(), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_motion_with_outliers_under_a_robust_kernel(rng):
     previous, current = (x[0] for x in drives(rng, 1))
     current = current.at[:12].add(jnp.asarray(rng.uniform(-40.0, 40.0, (12, 3)), jnp.float32))

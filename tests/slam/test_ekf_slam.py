@@ -144,6 +144,7 @@ def plain_filter(world, steps):
     return mean, covariance, index_of
 
 
+@pytest.mark.slow
 def test_equals_the_textbook_filter_while_errors_are_small(drives, x64):
     worlds, _, _ = drives
     world = jax.tree.map(lambda leaf: leaf[1], worlds)

@@ -1,6 +1,7 @@
 """Localization in a finished mosaic: errors against exact truth, a blank image, a restored run."""
 
 import numpy as np
+import pytest
 
 from jaxloc.data.simulate import floor
 from jaxloc.pipelines import floor_mosaic
@@ -10,6 +11,7 @@ from jaxloc.poses.planar import compose_poses, relative_poses
 PIXEL = 0.045 / (700.0 * 208 / 640)  # m
 
 
+@pytest.mark.slow
 def test_localization_on_a_second_drive(drive, built, check_resumed):
     rng = np.random.default_rng(4)
     photographer = floor.Photographer(drive.floor, drive.camera)

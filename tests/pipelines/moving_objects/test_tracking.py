@@ -74,7 +74,8 @@ def test_given_poses_and_dark_frames():
                 np.testing.assert_allclose(out.odometry.pose.matrix(), pose, atol=1e-6)
 
 
-@pytest.mark.parametrize("known", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [False, True])
 def test_a_restored_run_gives_the_same_numbers(check_resumed, known):
     street = simulate_street(num_frames=6, seed=0)
     poses = [jax.tree.map(lambda leaf, i=i: leaf[i], street.truth.poses) for i in range(6)]

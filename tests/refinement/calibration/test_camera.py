@@ -182,6 +182,7 @@ def test_outliers_are_outvoted(x64, rng):
     assert robust_gap < 0.2 * plain_gap
 
 
+@pytest.mark.slow
 def test_what_cannot_be_determined(x64, rng):
     corners = noisy(rng)
     flat = photos(tilts=np.tile([[0.1, 0.2, -0.1]], (NUM, 1)))

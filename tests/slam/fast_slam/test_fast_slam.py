@@ -100,6 +100,7 @@ def test_maps_are_near_those_of_ekf_slam(laps, x64):
     assert effective[2] > effective[1] > effective[0]
 
 
+@pytest.mark.slow
 def test_traced_paths_end_in_the_last_poses(laps, x64):
     _, answers = laps
     end, infos, path, poses = answers["MeasurementProposal"]
