@@ -195,3 +195,13 @@ def test_reads_real_sequences(recordings):
     assert float(sequence.rig.baseline) == pytest.approx(0.5371506, abs=1e-6)
     assert float(sequence.truth.length()) == pytest.approx(36.0, abs=1.0)
     sequence.verify()
+
+
+def test_poses_in_a_national_grid(tmp_path):
+    place = np.array([448262.123, 5411932.456, 300.0])
+    rows = [" ".join(f"{v:.4f}" for v in np.column_stack([np.eye(3), place + [k, 0.0, 0.0]]).ravel()) for k in range(3)]
+    (tmp_path / "p.txt").write_text("\n".join(rows) + "\n")
+    with pytest.raises(DataError, match="read it with an offset such as"):
+        kitti.read_poses(tmp_path / "p.txt")
+    path = kitti.read_poses(tmp_path / "p.txt", offset=place.tolist())
+    np.testing.assert_allclose(path.positions, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], atol=1e-6)

@@ -153,3 +153,19 @@ def test_images_of_16_bits(folder):
     cv2.imwrite(str(folder / "m.png"), np.array([[0, 65535, 52685]], np.uint16))
     grid = ros_map.read_map(folder / "m.yaml")
     np.testing.assert_allclose(grid.probability, [[1.0, 0.0, 1 - 52685 / 65535]], atol=1e-6)
+
+
+def test_an_origin_of_a_national_grid(folder, tmp_path):
+    """Single precision cannot hold the origin: an offset is taken off, or the map is refused."""
+    cv2.imwrite(str(folder / "m.png"), np.full((4, 6), 255, np.uint8))
+    text = (folder / "m.yaml").read_text()
+    line = next(line for line in text.splitlines() if line.startswith("origin"))
+    (folder / "m.yaml").write_text(text.replace(line, "origin: [448262.35, 5411932.65, 0.1]"))
+    offset = ros_map.read_offset(folder / "m.yaml")
+    assert offset.tolist() == [448000.0, 5412000.0]
+    grid = ros_map.read_map(folder / "m.yaml", offset=offset)
+    np.testing.assert_allclose(grid.origin.translation, [262.35, -67.35], atol=1e-4)
+    ros_map.write_map(tmp_path / "again.yaml", grid, offset=offset)
+    assert "origin: [448262.35, 5411932.65, 0.1" in (tmp_path / "again.yaml").read_text()
+    with pytest.raises(DataError, match=r"m.yaml: position \(448262.35, 5411932.65\) m is too large"):
+        ros_map.read_map(folder / "m.yaml")

@@ -48,3 +48,38 @@ def test_bad_files_are_refused(tmp_path, text, match):
     path.write_text(text)
     with pytest.raises(DataError, match=match):
         tum.read_trajectory(path)
+
+
+def test_large_coordinates_keep_their_shape(tmp_path, rng):
+    """A path in a national grid: what single precision would round to half a meter is taken off in double precision."""
+    positions = np.array([448262.123, 5411932.456, 300.0]) + np.cumsum(rng.normal(0.0, 0.05, (50, 3)), axis=0)
+    rows = np.column_stack([np.arange(50.0), positions, np.tile([0.0, 0.0, 0.0, 1.0], (50, 1))])
+    path = tmp_path / "a.tum"
+    np.savetxt(path, rows, fmt="%.9f")
+    stamped = tum.read_trajectory(path)
+    assert stamped.offset == (448000.0, 5412000.0, 0.0)
+    found = np.asarray(stamped.trajectory.positions, np.float64) + np.array(stamped.offset)
+    np.testing.assert_allclose(found, positions, atol=1e-4)
+    np.testing.assert_allclose(tum.planar_poses(stamped)[1][:, :2], positions[:, :2], atol=1e-4)
+    tum.write_trajectory(tmp_path / "b.tum", stamped.trajectory, offset=stamped.offset)
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "b.tum")[:, 1:4], positions, atol=1e-4)
+    other = tum.read_trajectory(path, offset=(448000.0, 5411000.0, 0.0))
+    np.testing.assert_allclose(other.trajectory.length(), stamped.trajectory.length(), rtol=1e-4)
+    with pytest.raises(DataError, match="too large to be held to a centimeter: read it with an offset such as"):
+        tum.read_trajectory(path, offset=(0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="must be 3 finite numbers"):
+        tum.read_trajectory(path, offset=(0.0, np.nan, 0.0))
+
+
+def test_small_coordinates_are_as_in_the_file(tmp_path):
+    (tmp_path / "a.tum").write_text("0 1500 -7000 3 0 0 0 1\n1 1501 -7000 3 0 0 0 1\n")
+    stamped = tum.read_trajectory(tmp_path / "a.tum")
+    assert stamped.offset == (0.0, 0.0, 0.0)
+    np.testing.assert_array_equal(stamped.trajectory.positions[0], [1500.0, -7000.0, 3.0])
+
+
+def test_double_precision_needs_no_offset(tmp_path, x64):
+    (tmp_path / "a.tum").write_text("0 448262.123 5411932.456 3 0 0 0 1\n")
+    stamped = tum.read_trajectory(tmp_path / "a.tum")
+    assert stamped.offset == (0.0, 0.0, 0.0)
+    np.testing.assert_allclose(stamped.trajectory.positions[0], [448262.123, 5411932.456, 3.0], rtol=1e-12)

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxloc.poses import SE3
+from jaxloc.poses import SE3, SO3
 from jaxloc.refinement import refine_pose
 from jaxloc.sensors import Pinhole
+from jaxloc.solvers import Status
 
 COUNT, SIGMA, DRAWS = 20, 0.3, 8
 
@@ -106,3 +107,21 @@ def test_a_refused_pose_has_no_gradient():
     fit = refine_pose(camera, points, pixels, pose, sigma=SIGMA)
     slope = jax.grad(lambda z: jnp.sum(refine_pose(camera, points, z, pose, sigma=SIGMA).value.translation))(pixels)
     assert not bool(fit.ok) and not np.asarray(slope).any()
+
+
+@pytest.mark.parametrize("offset, wide, expected", [(1e3, False, True), (5.4e6, False, False), (5.4e6, True, True)])
+def test_coordinates_that_rounding_spoils_are_refused(offset, wide, expected):
+    """Points in a national grid: in single precision they are rounded to half a meter, which is many pixels."""
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-1.0, 1.0, (COUNT, 3))
+    with jax.enable_x64(wide):
+        dtype = jnp.float64 if wide else jnp.float32
+        camera = Pinhole(*(jnp.asarray(x, dtype) for x in (800.0, 800.0, 320.0, 240.0)))
+        place = np.array([0.1 * offset, offset, 300.0])
+        seen = camera.project(jnp.asarray(points + [0.0, 0.0, 5.0], dtype))
+        pixels = seen + jnp.asarray(SIGMA * rng.standard_normal(seen.shape), dtype)
+        start = SE3(SO3.identity(), jnp.asarray(place - [0.0, 0.0, 5.0], dtype))
+        fit = refine_pose(camera, jnp.asarray(points + place, dtype), pixels, start, sigma=SIGMA)
+        assert bool(fit.ok) == expected
+        assert expected or Status(int(fit.status)) is Status.IMPRECISE
+        assert "rounding exceeds the stated noise" in fit.describe() or expected

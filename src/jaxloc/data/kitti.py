@@ -9,7 +9,7 @@
     poses/06.txt                          optional: 12 numbers a line, the rows of T_world_camera
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import equinox as eqx
@@ -19,6 +19,7 @@ from jaxtyping import Float64
 
 from jaxloc.data.io.errors import DataError
 from jaxloc.data.io.files import is_folder
+from jaxloc.data.io.offset import choose_offset, subtract_offset
 from jaxloc.data.io.png import read_image, read_size, verify_image
 from jaxloc.data.io.text import check_increasing, check_rotations, is_positive, parse_numbers, read_rows, read_text
 from jaxloc.data.io.writing import write_file
@@ -28,7 +29,17 @@ from jaxloc.sensors import Pinhole, StereoRig
 
 
 class KittiSequence(eqx.Module):
-    """A stereo recording on disk; frames are read on demand. Made by :func:`read_sequence`."""
+    """A stereo recording on disk; frames are read on demand. Made by :func:`read_sequence`.
+
+    Attributes:
+        name: of the folder.
+        rig: the cameras.
+        times: stamps, s.
+        truth: true poses, positions relative to `offset`; None where not known.
+        left_paths: images of the left camera.
+        right_paths: images of the right camera.
+        offset: (x, y, z) of the frame of the true poses in that of their file, of the same axes, m.
+    """
 
     name: str
     rig: StereoRig
@@ -36,6 +47,7 @@ class KittiSequence(eqx.Module):
     truth: Trajectory | None
     left_paths: tuple[Path, ...]
     right_paths: tuple[Path, ...]
+    offset: Float64[np.ndarray, "3"]
 
     def __len__(self) -> int:
         return len(self.left_paths)
@@ -70,7 +82,8 @@ def read_sequence(folder: Path | str, poses: Path | str | None = None) -> KittiS
         poses: true poses, 12 numbers a line; where not given, ``../../poses/<name>.txt`` is read if it is there.
 
     Returns:
-        The sequence. Its world frame is that of the poses file.
+        The sequence. Its world frame is that of the poses file, at an offset where the floating-point type could not
+        hold the coordinates to a millimeter.
 
     Raises:
         DataError: with one line that names the file or folder that is missing or wrong.
@@ -86,8 +99,12 @@ def read_sequence(folder: Path | str, poses: Path | str | None = None) -> KittiS
     if len(times) != len(left):
         raise DataError(folder / "times.txt", f"has {len(times)} times for {len(left)} images")
     truth_path = _find_poses(folder) if poses is None else Path(poses)
-    truth = None if truth_path is None else read_poses(truth_path, times=times)
-    return KittiSequence(folder.resolve().name, rig, times, truth, tuple(left), tuple(right))
+    truth, offset = None, np.zeros(3)
+    if truth_path is not None:
+        matrices = _read_matrices(truth_path, len(times))
+        offset = choose_offset(matrices[:, :3, 3])
+        truth = _trajectory(truth_path, times, matrices, offset)
+    return KittiSequence(folder.resolve().name, rig, times, truth, tuple(left), tuple(right), offset)
 
 
 def _camera_numbers(folder: Path) -> tuple[int, int]:
@@ -184,30 +201,53 @@ def read_times(path: Path | str) -> Float64[np.ndarray, " n"]:
     return times
 
 
-def read_poses(path: Path | str, *, times: Float64[np.ndarray, " n"] | None = None) -> Trajectory:
+def read_poses(
+    path: Path | str,
+    *,
+    times: Float64[np.ndarray, " n"] | None = None,
+    offset: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Trajectory:
     """Reads poses, 12 numbers a line: the rows of ``[R t]`` of ``T_world_camera``.
 
     Args:
         path: the file.
         times: the stamps of the poses, s; where not given, the number of the frame.
+        offset: (x, y, z) to subtract from positions, m.
 
     Returns:
         The path of the camera, with the rounding that the file has.
 
     Raises:
-        DataError: when the file is missing or malformed, has no poses, or not as many as there are times.
+        DataError: when the file is missing or malformed, has no poses, not as many as there are times, or positions are
+            too far from the offset to be held to a centimeter.
     """
+    matrices = _read_matrices(path, None if times is None else len(times))
+    if times is None:
+        times = np.arange(len(matrices), dtype=np.float64)
+    return _trajectory(path, times, matrices, offset)
+
+
+def _read_matrices(path: Path | str, count: int | None) -> Float64[np.ndarray, "n 4 4"]:
     rows = read_rows(path, 12)
     if not len(rows):
         raise DataError(path, "has no poses")
-    if times is None:
-        times = np.arange(len(rows), dtype=np.float64)
-    if len(rows) != len(times):
-        raise DataError(path, f"has {len(rows)} poses for {len(times)} frames")
+    if count is not None and len(rows) != count:
+        raise DataError(path, f"has {len(rows)} poses for {count} frames")
     matrices = np.tile(np.eye(4), (len(rows), 1, 1))
     matrices[:, :3] = rows.reshape(-1, 3, 4)
     check_rotations(path, matrices)
-    return Trajectory.from_matrices(jnp.asarray(times), jnp.asarray(matrices))
+    return matrices
+
+
+def _trajectory(
+    path: Path | str,
+    times: Float64[np.ndarray, " n"],
+    matrices: Float64[np.ndarray, "n 4 4"],
+    offset: Sequence[float] | np.ndarray,
+) -> Trajectory:
+    moved = matrices.copy()
+    moved[:, :3, 3] = subtract_offset(path, matrices[:, :3, 3], offset)
+    return Trajectory.from_matrices(jnp.asarray(times), jnp.asarray(moved))
 
 
 def format_pose(matrix: np.ndarray) -> str:

@@ -12,15 +12,17 @@
                               or raw (percent, and what is above is unknown)
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32, Num
+from jaxtyping import Float32, Float64, Num
 
 from jaxloc.data.io.errors import DataError
 from jaxloc.data.io.images import read_stored
+from jaxloc.data.io.offset import choose_offset, subtract_offset
 from jaxloc.data.io.text import is_positive
 from jaxloc.data.io.writing import write_file
 from jaxloc.data.io.yaml_file import describe, read_entries, to_number
@@ -28,17 +30,19 @@ from jaxloc.poses import SE2
 from jaxloc.sensors import OccupancyMap
 
 
-def read_map(path: Path | str) -> OccupancyMap:
+def read_map(path: Path | str, *, offset: Sequence[float] | np.ndarray = (0.0, 0.0)) -> OccupancyMap:
     """Reads a map.
 
     Args:
         path: the YAML file.
+        offset: (x, y) to subtract from the origin, m; see `read_offset`.
 
     Returns:
         The map; its rows grow with y.
 
     Raises:
-        DataError: when a file is missing or malformed, or a number cannot be.
+        DataError: when a file is missing or malformed, a number cannot be, or the origin is too far from the offset to
+            be held to a centimeter.
         ImportError: when pyyaml is not installed.
     """
     path = Path(path)
@@ -46,21 +50,41 @@ def read_map(path: Path | str) -> OccupancyMap:
     resolution = _number(path, "resolution", entries.get("resolution"))
     if not is_positive(resolution):
         raise DataError(path, f"resolution is {resolution:g}, must be positive")
-    origin = _origin(path, entries.get("origin"))
+    x, y, heading = _origin(path, entries.get("origin"))
+    corner = subtract_offset(path, np.array([[x, y]]), offset)[0]
     occupied = _number(path, "occupied_thresh", entries.get("occupied_thresh", 0.65))
     free = _number(path, "free_thresh", entries.get("free_thresh", 0.196))
     if not 0.0 <= free < occupied <= 1.0:
         raise DataError(path, f"0 <= free_thresh < occupied_thresh <= 1 must hold; they are {free:g} and {occupied:g}")
     probability = _probability(path, entries, occupied, free)
-    return OccupancyMap(jnp.asarray(probability), resolution, SE2(*origin), occupied, free)
+    return OccupancyMap(jnp.asarray(probability), resolution, SE2(*corner, heading), occupied, free)
 
 
-def write_map(path: Path | str, grid: OccupancyMap) -> None:
+def read_offset(path: Path | str) -> Float64[np.ndarray, "2"]:
+    """Reads what to subtract from coordinates of a map so that JAX's default floating-point type can hold them.
+
+    Args:
+        path: the YAML file.
+
+    Returns:
+        (x, y), m: zero but for origins beyond 8 km (in single precision), such as those of national grids; then the
+        origin, rounded to whole kilometers.
+
+    Raises:
+        DataError: when the file is missing or malformed, or has no origin.
+        ImportError: when pyyaml is not installed.
+    """
+    path = Path(path)
+    return choose_offset(np.array([_origin(path, read_entries(path, "map").get("origin"))[:2]]))
+
+
+def write_map(path: Path | str, grid: OccupancyMap, *, offset: Sequence[float] | np.ndarray = (0.0, 0.0)) -> None:
     """Writes a map as a YAML file and, beside it, a PGM image: black is occupied, white free, gray unknown.
 
     Args:
         path: the YAML file to be.
         grid: the map.
+        offset: (x, y) of the frame of the map in that of the file, m.
 
     Raises:
         DataError: when a file cannot be written.
@@ -71,11 +95,11 @@ def write_map(path: Path | str, grid: OccupancyMap) -> None:
     rows, columns = grid.probability.shape
     image = path.with_suffix(".pgm")
     write_file(image, b"P5\n%d %d\n255\n" % (columns, rows) + values[::-1].tobytes())
-    x, y, theta = (float(value) for value in (grid.origin.x, grid.origin.y, grid.origin.theta))
+    x, y = (float(value) + float(moved) for value, moved in zip((grid.origin.x, grid.origin.y), offset, strict=True))
     lines = (
         f"image: {image.name}",
         f"resolution: {float(grid.resolution):.7g}",
-        f"origin: [{x:.7g}, {y:.7g}, {theta:.7g}]",
+        f"origin: [{x:.10g}, {y:.10g}, {float(grid.origin.theta):.7g}]",
         "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
     )
     write_file(path, "\n".join(lines))

@@ -47,8 +47,8 @@ def refine_pose(
     Returns:
         Estimate of ``T_world_camera`` with covariance in its tangent (right perturbation: camera axes). ``ok`` is False
         when fewer than three independent points are visible, when a standard deviation exceeds a radian or the distance
-        (as of points on a line), when under plain least squares a point lies behind the
-        camera, or when the solver did not converge.
+        (as of points on a line), when coordinates are so large that their rounding exceeds `sigma`, when under plain
+        least squares a point lies behind the camera, or when the solver did not converge.
 
     References:
         Lepetit and Fua, "Monocular model-based 3D tracking of rigid objects", 2005, section 2.4 [K-56, K-73].
@@ -68,7 +68,9 @@ def refine_pose(
     center = _seen_from(initial, mean)
     problem = Reprojection(camera, points.T, pixels.T, sigma, usable, loss, center)
     fit = solve(problem, _shifted(initial, center), solver=solver)
-    return _refuse_vague(_about_camera(fit, center), fit.covariance, mean)
+    vague, imprecise = _is_vague(fit, mean, _shifted(fit.value, -center)), _is_imprecise(fit, points, usable)
+    fit = _about_camera(fit, center)
+    return _refuse(_refuse(fit, vague, Status.RANK_DEFICIENT), imprecise, Status.IMPRECISE)
 
 
 def _mean(points: Float[Array, "n 3"], usable: Bool[Array, " n"], pose: SE3) -> Float[Array, "3"]:
@@ -95,16 +97,32 @@ def _shifted(pose: SE3, offset: Float[Array, "3"]) -> SE3:
     return SE3(pose.rotation, pose.apply(offset[None])[0])
 
 
-def _refuse_vague(fit: Estimate, covariance: Float[Array, "6 6"], mean: Float[Array, "3"]) -> Estimate:
-    """Refuses an estimate of whose direction or distance nothing is known: of points on a line, for instance.
+def _is_vague(fit: Estimate, mean: Float[Array, "3"], camera: SE3) -> Bool[Array, ""]:
+    """Whether nothing is known of the direction or the distance: of points on a line, for instance.
 
-    Its rank depends on rounding, and so on the precision; standard deviations do not. Beyond a radian, or the distance
-    of the points, the linearization means nothing. The covariance is that of the frame at the center.
+    The rank depends on rounding, and so on the precision; standard deviations do not. Beyond a radian, or the distance
+    of the points, the linearization means nothing. The fit is that of the frame at the center.
     """
-    variance, offset = lax.stop_gradient((jnp.diagonal(covariance), mean - fit.value.translation))
-    vague = (jnp.sum(variance[3:]) > 1.0) | (jnp.sum(variance[:3]) > jnp.sum(offset * offset))
-    ok = fit.ok & ~vague
-    status = jnp.where(fit.ok & vague, int(Status.RANK_DEFICIENT), fit.status)
+    variance, offset = lax.stop_gradient((jnp.diagonal(fit.covariance), mean - camera.translation))
+    return (jnp.sum(variance[3:]) > 1.0) | (jnp.sum(variance[:3]) > jnp.sum(offset * offset))
+
+
+def _is_imprecise(fit: Estimate, points: Float[Array, "n 3"], usable: Bool[Array, " n"]) -> Bool[Array, ""]:
+    """Whether rounding of the points moves their pixels by more than a standard deviation, in the root mean square.
+
+    Points and camera move pixels alike: the information about the position, which does not depend on the frame's
+    center, is the sum over the points of what a displacement does to whitened residuals.
+    """
+    size = jnp.max(jnp.where(usable[:, None], jnp.abs(points), 0.0), initial=0.0)
+    # Variance of a number that was rounded to the nearest one, for each of the three coordinates.
+    variance = (size * float(jnp.finfo(points.dtype).eps)) ** 2 / 12.0
+    information = jnp.sum(jnp.diagonal(fit.information)[:3])
+    return lax.stop_gradient(variance * information > 2.0 * jnp.sum(usable, dtype=points.dtype))
+
+
+def _refuse(fit: Estimate, wrong: Bool[Array, ""], reason: Status) -> Estimate:
+    ok = fit.ok & ~wrong
+    status = jnp.where(fit.ok & wrong, int(reason), fit.status)
     found = fit.value, fit.covariance, fit.cost, fit.information
     value, covariance, cost, information = tree.detach_unless(ok, found)
     return Estimate(value, covariance, cost, ok, fit.num_steps, status, information)

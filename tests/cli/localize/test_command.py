@@ -2,12 +2,15 @@
 
 import json
 
+import equinox as eqx
 import numpy as np
 import pytest
 import yaml
 
 from jaxloc.cli import run
+from jaxloc.cli.localize.report import Reference
 from jaxloc.data import ros_map, simulate_laser_drive, tum
+from jaxloc.poses.planar import compose_poses, planar_matrix
 
 FILES = ["config.yaml", "metrics.json", "report.html", "spread.csv", "trajectory.tum"]
 SCANS = 30
@@ -71,6 +74,39 @@ def test_every_file_is_written(drive, inputs, tmp_path, capsys):
     assert config["config"]["odometry"]["slip"] == 0.1
 
 
+def test_odometry_is_no_reference(drive):
+    times, odometry = drive.log.times[:SCANS], drive.log.odometry[:SCANS]
+    log = eqx.tree_at(lambda log: (log.times, log.odometry), drive.log, (times, odometry))
+    assert Reference(times, odometry.round(3)).is_odometry(log)
+    assert Reference(times, compose_poses(np.array([[3.0, -1.0, 2.0]] * SCANS), odometry)).is_odometry(log)
+    assert not Reference(times, drive.truth[:SCANS]).is_odometry(log)
+    assert not Reference(times, odometry + np.linspace(0.0, 0.02, SCANS)[:, None]).is_odometry(log)
+    still = eqx.tree_at(lambda log: log.odometry, log, 0.0 * odometry)
+    assert not Reference(times, still.odometry).is_odometry(still)
+
+
+@pytest.mark.slow
+def test_a_map_in_a_national_grid(drive, inputs, tmp_path):
+    """Coordinates that single precision cannot hold: the path is that of a map near zero, moved."""
+    place = [448262.35, 5411932.65]
+    text = (inputs / "map.yaml").read_text()
+    x, y, heading = yaml.safe_load(text)["origin"]
+    far = {**yaml.safe_load(text), "origin": [x + place[0], y + place[1], heading], "image": str(inputs / "map.pgm")}
+    (tmp_path / "far.yaml").write_text(yaml.safe_dump(far))
+    rows = np.loadtxt(inputs / "truth.tum")
+    rows[:, 1:3] += place
+    np.savetxt(tmp_path / "truth.tum", rows, fmt="%.9f")
+    start = [f"{value:.4f}" for value in drive.truth[0] + np.array([*place, 0.0])]
+    options = ["--reference", tmp_path / "truth.tum", "--config", inputs / "options.yaml", "--out", tmp_path / "out"]
+    command = ["localize", inputs / "drive.log", "--map", tmp_path / "far.yaml", "--start", *start, *options]
+    assert run([str(a) for a in command]) == 0
+    path = np.loadtxt(tmp_path / "out" / "trajectory.tum")
+    np.testing.assert_allclose(path[:, 1:3] - np.array(place), drive.truth[:SCANS, :2], atol=0.3)
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["error_median_m"] < 0.1
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Figures count from x 448000 m, y 5412000 m of the map." in page
+
+
 def test_a_global_start_without_a_reference(inputs, tmp_path):
     out = tmp_path / "out"
     options = ["--config", inputs / "options.yaml", "--out", out]
@@ -80,7 +116,7 @@ def test_a_global_start_without_a_reference(inputs, tmp_path):
     assert "<h2>Error</h2>" not in (out / "report.html").read_text()
 
 
-def test_bad_input_is_one_line_and_writes_nothing(inputs, tmp_path, refused):
+def test_bad_input_is_one_line_and_writes_nothing(drive, inputs, tmp_path, refused):
     out = tmp_path / "out"
     log, grid = inputs / "drive.log", inputs / "map.yaml"
 
@@ -112,6 +148,11 @@ def test_bad_input_is_one_line_and_writes_nothing(inputs, tmp_path, refused):
     other = tmp_path / "other.tum"
     other.write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
     refuse(r"other.tum: has no pose at the time of any scan", extra=["--reference", other])
+    rows = []
+    for number, pose in enumerate(compose_poses(np.array([[3.0, -1.0, 2.0]] * SCANS), drive.log.odometry[:SCANS])):
+        rows.append(tum.format_pose(100.0 + drive.log.times[number], planar_matrix(pose)))
+    other.write_text("\n".join(rows) + "\n")
+    refuse(r"other.tum: holds the odometry of the log, which is no reference", extra=["--reference", other])
     options = tmp_path / "bad.yaml"
     options.write_text("num_particles: 0\n")
     refuse(r"bad.yaml: num_particles is 0, must be at least 1", extra=["--config", options])

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from jaxloc.cli import lifecycle
 from jaxloc.cli.lifecycle import Arguments
@@ -54,9 +55,10 @@ def run_log(
     lifecycle.prepare(arguments.out)
     if initial is not None and not np.isfinite(initial).all():
         raise DataError("--start", "must be three finite numbers")
-    grid = _read_map(map_path)
+    offset = np.array([*ros_map.read_offset(map_path), 0.0])
+    grid = _read_map(map_path, offset[:2])
     log = carmen.read_log(path)
-    record = report.Record(log, grid, _read_reference(reference, log))
+    record = report.Record(log, grid, _read_reference(reference, log, offset), offset[:2])
     config = arguments.read(default_config())
     inputs = {
         "command": "localize",
@@ -68,18 +70,19 @@ def run_log(
     from jaxloc.pipelines import localization
 
     def write(output: Any, rows: Mapping[str, RowWriter]) -> None:
-        rows["trajectory.tum"].append(tum.format_pose(output.time, planar_matrix(output.pose)))
+        rows["trajectory.tum"].append(tum.format_pose(output.time, planar_matrix(output.pose + offset)))
         rows["spread.csv"].append(_sigma_row(output))
         record.add(output)
 
     with lifecycle.open_run(arguments.out) as run:
-        outputs = localization.run(log, config, grid, initial=None if initial is None else SE2(*initial))
+        start = None if initial is None else SE2(*(np.array(initial) - offset))
+        outputs = localization.run(log, config, grid, initial=start)
         run.stream(outputs, write, title="localization", total=len(log), files=_FILES)
         return run.finish(record, config, inputs, _summary)
 
 
-def _read_map(path: Path) -> OccupancyMap:
-    grid = ros_map.read_map(path)
+def _read_map(path: Path, offset: Float64[np.ndarray, "2"]) -> OccupancyMap:
+    grid = ros_map.read_map(path, offset=offset)
     if not bool(np.asarray(grid.occupied).any()):
         raise DataError(path, "shows no obstacle: there is nothing to localize by")
     if not bool(np.asarray(grid.free).any()):
@@ -87,13 +90,17 @@ def _read_map(path: Path) -> OccupancyMap:
     return grid
 
 
-def _read_reference(path: Path | None, log: LaserLog) -> report.Reference | None:
-    """Poses to compare with: those of the file, or those that the log itself holds."""
+def _read_reference(path: Path | None, log: LaserLog, offset: Float64[np.ndarray, "3"]) -> report.Reference | None:
+    """Poses to compare with, less the offset of the map: those of the file, or those that the log itself holds."""
     if path is None:
-        return None if log.corrected is None else report.Reference(log.times, log.corrected)
-    reference = report.Reference(*planar_poses(tum.read_trajectory(path)))
+        reference = None if log.corrected is None else report.Reference(log.times, log.corrected - offset)
+        return None if reference is None or reference.is_odometry(log) else reference
+    times, poses = planar_poses(tum.read_trajectory(path))
+    reference = report.Reference(times, poses - offset)
     if not len(reference.match(log.times)[0]):
         raise DataError(path, "has no pose at the time of any scan of the log")
+    if reference.is_odometry(log):
+        raise DataError(path, "holds the odometry of the log, which is no reference: it is an input of the estimate")
     return reference
 
 

@@ -13,6 +13,8 @@ from jaxloc.poses.planar import relative_poses
 from jaxloc.sensors import OccupancyMap
 
 _SAME_TIME = 0.02  # stamps of one instant, s
+_SAME_POSE = 2e-3  # m and rad of rounding in files
+_MOVED = 0.05  # m or rad; of a robot that stood still no two paths can be told apart
 _NUM_CLOUDS = 6
 
 
@@ -36,6 +38,17 @@ class Reference(eqx.Module):
         indices = np.flatnonzero(np.abs(self.times[nearest] - times) <= _SAME_TIME)
         return indices, nearest[indices]
 
+    def is_odometry(self, log: LaserLog) -> bool:
+        """Whether these poses are the odometry of the log, up to their frame: an input, no truth."""
+        indices, partners = self.match(log.times)
+        if len(indices) < 2:
+            return False
+        paths = log.odometry[indices], self.poses[partners]
+        moved = [relative_poses(np.broadcast_to(path[:1], path.shape), path) for path in paths]
+        difference = moved[1] - moved[0]
+        difference[:, 2] = np.arctan2(np.sin(difference[:, 2]), np.cos(difference[:, 2]))
+        return bool(np.abs(moved[0]).max() > _MOVED and np.abs(difference).max() < _SAME_POSE)
+
 
 class Record:
     """Outputs of a run so far.
@@ -44,12 +57,20 @@ class Record:
         log: the recording.
         grid: the map.
         reference: poses to compare with.
+        offset: (x, y) of the frame of the outputs, the map and the reference in the frame of their files, m.
     """
 
-    def __init__(self, log: LaserLog, grid: OccupancyMap, reference: Reference | None):
+    def __init__(
+        self,
+        log: LaserLog,
+        grid: OccupancyMap,
+        reference: Reference | None,
+        offset: Float64[np.ndarray, "2"],
+    ):
         self.log = log
         self.grid = grid
         self.reference = reference
+        self.offset = offset
         self.interrupted = False
         self.outputs: list[Any] = []
 
@@ -131,6 +152,10 @@ class Record:
         sections += self._error_section() + self._confidence_sections()
         sections.append(results.numbers_section(metrics))
         summary = f"{metrics['scans']} scans, {metrics['scans_used']} used. {self.log.mounting}".rstrip()
+        if self.reference is None and self.log.corrected is not None:
+            summary += " Poses in the log are its odometry: they are no reference to compare with."
+        if self.offset.any():
+            summary += " Figures count from x {:.0f} m, y {:.0f} m of the map.".format(*self.offset)
         if self.interrupted:
             summary += " Interrupted: the report ends with the last scan that was processed."
         title = f"Laser localization: {self.log.name}"

@@ -47,6 +47,9 @@ def format_track(
         lengths = [len(values) for values in (position, velocity, variances, uv)]
         raise ValueError(f"Give 3 (or 2) numbers of position, velocity and variances, and 2 or no pixels: {lengths}")
     words = [str(frame), str(identity)]
-    for values in (position, velocity, variances):
-        words += [f"{value:.6g}" for value in values] + [""] * (3 - size)
+    # Six digits, but a millimeter of coordinates of a kilometer and more.
+    texts = [[f"{value:.3f}" if abs(value) >= 1000.0 else f"{value:.6g}" for value in position]]
+    texts += [[f"{value:.6g}" for value in values] for values in (velocity, variances)]
+    for text in texts:
+        words += text + [""] * (3 - size)
     return ",".join([*words, *([f"{value:.6g}" for value in uv] or ["", ""])])

@@ -94,6 +94,23 @@ def test_cars_in_the_world(inputs, tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
+def test_poses_in_a_national_grid(inputs, tmp_path):
+    """The tracks are those in a frame near the cameras, moved."""
+    place = np.array([448262.25, 5411932.5, 300.0])
+    rows = np.loadtxt(inputs / "poses.txt").reshape(-1, 3, 4)
+    rows[:, :, 3] += place
+    np.savetxt(tmp_path / "poses.txt", rows.reshape(-1, 12), fmt="%.6f")
+    options = ["--calib", inputs / "calib.txt", "--truth", inputs / "labels.txt"]
+    found = []
+    for name, poses in (("near", inputs / "poses.txt"), ("far", tmp_path / "poses.txt")):
+        assert call("--detections", inputs / "cars.txt", "--poses", poses, *options, "--out", tmp_path / name) == 0
+        found.append(table(tmp_path / name / "tracks.csv"))
+    near, far = found
+    np.testing.assert_allclose(far[:, 2:5] - place, near[:, 2:5], atol=2e-3)
+    np.testing.assert_allclose(far[:, 11:], near[:, 11:], atol=0.2)
+
+
 def test_boxes_in_images(inputs, tmp_path):
     out = tmp_path / "out"
     assert call("--detections", inputs / "det.txt", "--truth", inputs / "gt.txt", "--out", out) == 0

@@ -58,6 +58,21 @@ def test_rows_images_and_report(recording, tmp_path):
     assert "Seen from above" in (out / "report.html").read_text()
     assert len((out / "trajectory.txt").read_text().splitlines()) == FRAMES
 
+    place = np.array([448262.25, 5411932.5, 300.0])
+    poses = np.loadtxt(recording / "poses.txt").reshape(-1, 3, 4)
+    poses[:, :, 3] += place
+    np.savetxt(tmp_path / "far.txt", poses.reshape(-1, 12), fmt="%.9f")
+    result = run("track", recording, "--poses", tmp_path / "far.txt", "--out", tmp_path / "far")
+    assert result.exit_code == 0, result.output
+    given = np.loadtxt(tmp_path / "far" / "trajectory.txt")[:, [3, 7, 11]]
+    np.testing.assert_allclose(given, poses[:, :, 3], atol=1e-3)
+    with (tmp_path / "far" / "tracks.csv").open() as file:
+        far = list(csv.DictReader(file))
+    assert [(row["frame"], row["id"]) for row in far] == [(row["frame"], row["id"]) for row in rows]
+    for name, shift in zip("xyz", place, strict=True):
+        there, here = (np.array([float(row[name]) for row in table]) for table in (far, rows))
+        np.testing.assert_allclose(there - shift, here, atol=0.05)
+
 
 def test_bad_input_is_one_line(tmp_path):
     from jaxloc.cli import run as run_command

@@ -13,6 +13,7 @@ from jaxloc.cli import lifecycle
 from jaxloc.cli.lifecycle import Arguments
 from jaxloc.cli.track.detections import report
 from jaxloc.data import DataError
+from jaxloc.data.io.offset import choose_offset, subtract_offset
 from jaxloc.data.io.text import read_text
 from jaxloc.data.io.writing import RowWriter
 from jaxloc.data.tracking import Detections, LabeledTracks, kitti_tracking, mot, tracks_csv
@@ -67,14 +68,14 @@ def run_detections(inputs: Inputs, arguments: Arguments) -> int:
     """
     lifecycle.prepare(arguments.out)
     form = _find_format(inputs)
-    found, truth, poses = _read_kitti(inputs) if form == "kitti" else _read_mot(inputs)
+    found, truth, poses, offset = _read_kitti(inputs) if form == "kitti" else _read_mot(inputs)
     if not found.valid.any():
         raise DataError(inputs.detections, "holds no detection that can be used")
     projection = None
     if inputs.calibration is not None:
         projection = kitti_tracking.read_calibration(inputs.calibration).projections[2]
     config = arguments.read(default_config(form, inputs.tracker))
-    record = report.Record(f"Tracks: {inputs.detections.name}", found, truth=truth, cameras=poses)
+    record = report.Record(f"Tracks: {inputs.detections.name}", found, truth=truth, cameras=poses, offset=offset)
 
     def write(pair: tuple[float, Any], rows: Mapping[str, RowWriter]) -> None:
         record.add(*pair)
@@ -105,12 +106,17 @@ def _find_format(inputs: Inputs) -> str:
     return form
 
 
-def _read_kitti(inputs: Inputs) -> tuple[Detections, LabeledTracks | None, np.ndarray | None]:
-    poses = None if inputs.poses is None else kitti_tracking.read_camera_poses(inputs.poses)
+def _read_kitti(inputs: Inputs) -> tuple[Detections, LabeledTracks | None, np.ndarray | None, np.ndarray]:
+    """Detections, truth and poses of the camera in a frame at an offset, and that offset."""
+    poses, offset = None, np.zeros(3)
+    if inputs.poses is not None:
+        poses = kitti_tracking.read_camera_poses(inputs.poses)
+        offset = choose_offset(poses[:, :3, 3])
+        poses[:, :3, 3] = subtract_offset(inputs.poses, poses[:, :3, 3], offset)
     count = None if poses is None else len(poses)
     found = kitti_tracking.read_detections(inputs.detections, num_frames=count, poses=poses)
     if inputs.truth is None:
-        return found, None, poses
+        return found, None, poses, offset
     kinds = np.unique(found.types[found.valid])
     types = tuple(kitti_tracking.TYPES[kind] for kind in kinds)
     truth = kitti_tracking.read_labels(inputs.truth, types=types, num_frames=count, poses=poses)
@@ -118,17 +124,17 @@ def _read_kitti(inputs: Inputs) -> tuple[Detections, LabeledTracks | None, np.nd
         count = max(len(found), len(truth.detections))
         found = kitti_tracking.read_detections(inputs.detections, num_frames=count)
         truth = kitti_tracking.read_labels(inputs.truth, types=types, num_frames=count)
-    return found, truth, poses
+    return found, truth, poses, offset
 
 
-def _read_mot(inputs: Inputs) -> tuple[Detections, LabeledTracks | None, None]:
+def _read_mot(inputs: Inputs) -> tuple[Detections, LabeledTracks | None, None, np.ndarray]:
     found = mot.read_mot_detections(inputs.detections)
     if inputs.truth is None:
-        return found, None, None
+        return found, None, None, np.zeros(2)
     truth = mot.read_mot_tracks(inputs.truth)
     count = max(len(found), len(truth.detections))
     found = mot.read_mot_detections(inputs.detections, num_frames=count)
-    return found, mot.read_mot_tracks(inputs.truth, num_frames=count), None
+    return found, mot.read_mot_tracks(inputs.truth, num_frames=count), None, np.zeros(2)
 
 
 def _outputs(found: Detections, poses: np.ndarray | None, config: Any) -> Iterator[tuple[float, Any]]:
@@ -152,9 +158,8 @@ def _row(record: report.Record, frame: int, slot: int, projection: np.ndarray | 
     variances = np.diagonal(output.covariances[slot])[:size]
     uv = _pixel(record, frame, slot, projection)
     number, identity = int(record.found.frames[frame]), int(output.ids[slot])
-    return tracks_csv.format_track(
-        number, identity, output.places[slot, :size], output.velocities[slot, :size], variances, uv
-    )
+    position = np.asarray(output.places[slot, :size], np.float64) + record.offset
+    return tracks_csv.format_track(number, identity, position, output.velocities[slot, :size], variances, uv)
 
 
 def _pixel(record: report.Record, frame: int, slot: int, projection: Float64[np.ndarray, "3 4"] | None) -> list[float]:

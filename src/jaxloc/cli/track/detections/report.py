@@ -26,6 +26,7 @@ class Record:
         found: the detections.
         truth: true tracks.
         cameras: T_world_camera, where known.
+        offset: of the frame of positions in that of the results, m.
     """
 
     def __init__(
@@ -35,8 +36,9 @@ class Record:
         *,
         truth: LabeledTracks | None = None,
         cameras: Float64[np.ndarray, "t 4 4"] | None = None,
+        offset: Float64[np.ndarray, " d"],
     ):
-        self.title, self.found, self.truth, self.cameras = title, found, truth, cameras
+        self.title, self.found, self.truth, self.cameras, self.offset = title, found, truth, cameras, offset
         self.interrupted = False
         self.outputs: list[Any] = []
         self.boxes: list[list[np.ndarray | None]] = []

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float64
 
 from jaxloc.cli import lifecycle, session
 from jaxloc.cli.lifecycle import Arguments
@@ -16,6 +17,7 @@ from jaxloc.data.tracking import tracks_csv
 from jaxloc.evaluation import plots
 
 _NUM_IMAGES = 8  # annotated frames of a run
+_NONE = np.zeros(3)
 _FILES = {"tracks.csv": tracks_csv.HEADER, "trajectory.txt": None}
 
 
@@ -49,11 +51,20 @@ def run_recording(folder: Path, poses: Path | None, arguments: Arguments) -> int
         raise DataError(poses, "holds no poses")
     inputs = {"command": "track", "sequence": str(folder), "poses": None if poses is None else str(poses)}
     title = f"Moving objects: {sequence.name}"
-    return run_sequence(sequence, config, arguments.out, inputs, title=title, known=poses is not None)
+    return run_sequence(
+        sequence, config, arguments.out, inputs, title=title, known=poses is not None, offset=sequence.offset
+    )
 
 
 def run_sequence(
-    sequence: StereoSequence, config: Any, out: Path, inputs: dict[str, Any], *, title: str, known: bool = False
+    sequence: StereoSequence,
+    config: Any,
+    out: Path,
+    inputs: dict[str, Any],
+    *,
+    title: str,
+    known: bool = False,
+    offset: Float64[np.ndarray, "3"] = _NONE,
 ) -> int:
     """Runs the pipeline on a sequence and writes everything.
 
@@ -64,18 +75,21 @@ def run_sequence(
         inputs: what the command was given.
         title: of the report.
         known: whether the sequence's poses are used in place of the odometry's.
+        offset: of the frame of these poses in the frame of the results, m.
 
     Returns:
         Exit code.
     """
-    record = report.Record(title)
+    record, offset = report.Record(title), offset if known else _NONE
     shown = set(np.linspace(0, len(sequence) - 1, _NUM_IMAGES + 1).round().astype(int)[1:].tolist())
 
     def write(pair: tuple[Any, Any], rows: Mapping[str, RowWriter]) -> None:
         frame, output = pair
         for track in output.tracks:
-            rows["tracks.csv"].append(_row(output.index, track))
-        rows["trajectory.txt"].append(kitti.format_pose(np.asarray(output.odometry.pose.matrix(), np.float64)))
+            rows["tracks.csv"].append(_row(output.index, track, offset))
+        pose = np.array(output.odometry.pose.matrix(), np.float64)
+        pose[:3, 3] += offset
+        rows["trajectory.txt"].append(kitti.format_pose(pose))
         record.add(output)
         if output.index in shown:
             figure = plots.draw_objects(frame.left, output.points, output.boxes, *_positions(output.tracks))
@@ -100,9 +114,9 @@ def _outputs(sequence: StereoSequence, config: Any, known: bool) -> Iterator[tup
         yield frame, output
 
 
-def _row(index: int, track: Any) -> str:
+def _row(index: int, track: Any, offset: Float64[np.ndarray, "3"]) -> str:
     state, variances = np.asarray(track.state, float), np.diagonal(track.covariance)[:3]
-    return tracks_csv.format_track(index, track.label, state[:3], state[3:], variances, track.uv)
+    return tracks_csv.format_track(index, track.label, state[:3] + offset, state[3:], variances, track.uv)
 
 
 def _positions(tracks: tuple[Any, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
