@@ -71,7 +71,7 @@ def test_steps(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in TRACKERS if name != "GmCphd"])
+@pytest.mark.parametrize("name", TRACKERS)
 def test_a_sentinel_is_an_absent_measurement(name):
     """One reading of a target with a huge number or NaN: both targets are there some scans later."""
     parameters = BASE | {"q": jnp.array(0.1)}
