@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc.alignment.lucas_kanade.align import finish, initial_warp, prepare, search
 from jaxloc.alignment.lucas_kanade.covariance import AlignmentData
 from jaxloc.alignment.lucas_kanade.iteration import SearchResult
@@ -81,7 +82,7 @@ def align(
     return _align(prepare(image, template, weights, sigma, method), warps, min(keep, *warps.batch_shape))
 
 
-@eqx.filter_jit
+@filter_jit
 def _align(data: AlignmentData, initial: Warp, keep: int) -> Estimate:
     detached = jax.lax.stop_gradient(data)
     coarsest, *finer = detached.levels()

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc import _linalg
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.alignment.correlation.peaks import find_peaks
 from jaxloc.images.interpolation import Bicubic, sample
@@ -43,7 +44,7 @@ class _Peak(eqx.Module):
     ok: Bool[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 def translation(
     previous: Num[Array, "h w"] | Any, current: Num[Array, "h w"] | Any, *, bandwidth: float = 0.25
 ) -> Estimate:
@@ -82,7 +83,7 @@ def translation(
     return _estimate(Translation(peak.uv), peak.covariance, peak.information, peak.height, peak.ok, finite)
 
 
-@eqx.filter_jit
+@filter_jit
 def similarity(
     image: Num[Array, "h w"] | Any,
     template: Num[Array, "h w"] | Any,

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.images.interpolation import Bicubic, sample_components
 from jaxloc.images.normalization import as_gray
@@ -70,7 +71,7 @@ class PlaneAppearance(Problem):
         return jnp.where(known, (values - expected) / self.sigma, 0.0)
 
 
-@eqx.filter_jit
+@filter_jit
 def refine_pose(
     image: Num[Array, "h w"] | Any,
     plane: TexturedPlane,

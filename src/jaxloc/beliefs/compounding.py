@@ -2,15 +2,15 @@
 
 from typing import Any
 
-import equinox as eqx
 from jaxtyping import Array
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs.gaussian import Gaussian
 from jaxloc.poses.lie_group import Group
 
 
-@eqx.filter_jit
+@filter_jit
 def compose(a: Gaussian, b: Gaussian) -> Gaussian:
     """Density of ``T_a_b @ T_b_c`` for independent factors, to first order.
 
@@ -41,7 +41,7 @@ def compose(a: Gaussian, b: Gaussian) -> Gaussian:
     return Gaussian(a.mean @ b.mean, _transported(b.mean.inverse(), a.covariance) + b.covariance)
 
 
-@eqx.filter_jit
+@filter_jit
 def invert(a: Gaussian) -> Gaussian:
     """Density of the inverse pose: ``P' = Ad(A) P Ad(A)^T``, exact in the tangent space.
 
@@ -67,7 +67,7 @@ def invert(a: Gaussian) -> Gaussian:
     return Gaussian(a.mean.inverse(), _transported(a.mean, a.covariance))
 
 
-@eqx.filter_jit
+@filter_jit
 def relative(a: Gaussian, b: Gaussian) -> Gaussian:
     """Density of ``T_w_a^-1 @ T_w_b`` for independent poses in one frame, to first order.
 

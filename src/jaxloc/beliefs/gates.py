@@ -2,13 +2,13 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.special import gammainc, gammaincc, gammaln, ndtri
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.poses.lie_group import as_floats
 
 _NEWTON_STEPS = 12
@@ -86,12 +86,12 @@ def gate(mahalanobis_squared: Float[Array, "*n"], dof: Any, probability: Any) ->
     return mahalanobis_squared <= threshold
 
 
-@eqx.filter_jit
+@filter_jit
 def _cdf(x: Array, dof: Array) -> Array:
     return gammainc(0.5 * lax.stop_gradient(dof), 0.5 * jnp.maximum(x, 0.0))
 
 
-@eqx.filter_jit
+@filter_jit
 def _quantile(probability: Array, dof: Array) -> Array:
     info = jnp.finfo(probability.dtype)
     probability = jnp.clip(probability, float(info.tiny) ** 0.5, 1.0 - float(info.eps))

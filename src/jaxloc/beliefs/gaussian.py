@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import validity
 from jaxloc.beliefs.square_root import cholesky, solve, whiten
@@ -50,12 +51,12 @@ class Gaussian(eqx.Module):
         """Number of degrees of freedom of one density."""
         return self.covariance.shape[-1]
 
-    @eqx.filter_jit
+    @filter_jit
     def mahalanobis_squared(self, x: Any) -> Float[Array, ""]:
         """Squared distance ``d^T P^-1 d``, ``d = local(mean, x)``: chi-square with `dimension` degrees of freedom."""
         return jnp.sum(whiten(cholesky(self.covariance), local(self.mean, x)) ** 2)
 
-    @eqx.filter_jit
+    @filter_jit
     def log_prob(self, x: Any) -> Float[Array, ""]:
         """Log density at x with respect to volume in the tangent space of the mean.
 
@@ -67,7 +68,7 @@ class Gaussian(eqx.Module):
         log_volume = jnp.sum(jnp.log(jnp.diagonal(root)))
         return -0.5 * distance - log_volume - 0.5 * self.dimension * math.log(2.0 * math.pi)
 
-    @eqx.filter_jit
+    @filter_jit
     def sample(self, num_samples: int, *, key: Key[Array, ""]) -> Any:
         """Random samples, stacked along a leading axis."""
         normal = jax.random.normal(key, (num_samples, self.dimension), self.covariance.dtype)
@@ -81,7 +82,7 @@ class Gaussian(eqx.Module):
         return Gaussian(self.mean[chosen], self.covariance[chosen[:, None], chosen[None, :]])
 
 
-@eqx.filter_jit
+@filter_jit
 def fuse(a: Gaussian, b: Gaussian) -> Gaussian:
     """Information fusion: the normalized product of two densities of one vector.
 

@@ -11,6 +11,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import validity
 from jaxloc.beliefs.gaussian import Gaussian
@@ -134,7 +135,7 @@ class Mixture(eqx.Module):
         """The mixture with weights scaled by a number, or by one for each component."""
         return Mixture(self.weights * factor, self.means, self.covariances, self.labels)
 
-    @eqx.filter_jit
+    @filter_jit
     def log_intensity(self, x: Any) -> Float[Array, ""]:
         """``log D(x)``, with respect to volume in the tangent spaces; a log density when the weights sum to one."""
         log_prob = jax.vmap(lambda mean, covariance: Gaussian(mean, covariance).log_prob(x))
@@ -142,7 +143,7 @@ class Mixture(eqx.Module):
         weights = jnp.where(self.valid, self.weights, 1.0)
         return logsumexp(jnp.where(self.valid, jnp.log(weights) + terms, -jnp.inf))
 
-    @eqx.filter_jit
+    @filter_jit
     def gaussian(self) -> Gaussian:
         """The normal density with the mean and covariance of the mixture, normalized by its mass."""
         best = jnp.argmax(self.weights)

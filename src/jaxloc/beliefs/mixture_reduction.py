@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs.mixture import Mixture
 from jaxloc.beliefs.square_root import whiten
@@ -81,7 +82,7 @@ class Reduced(eqx.Module):
     crowded: Int[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 def reduce_mixture(
     mixture: Mixture,
     capacity: int,

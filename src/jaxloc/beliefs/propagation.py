@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs.gaussian import Gaussian
 from jaxloc.beliefs.square_root import cholesky
@@ -17,7 +17,7 @@ from jaxloc.poses import is_flat, local, retract
 _MEAN_STEPS = 3  # of the intrinsic mean on a manifold; the error is squared each time
 
 
-@eqx.filter_jit
+@filter_jit
 def propagate_linear(f: Callable[[Any], Any], gaussian: Gaussian) -> Gaussian:
     """Density of ``f(x)`` to first order: ``f(m)`` and ``J P J^T``.
 
@@ -47,7 +47,7 @@ def propagate_linear(f: Callable[[Any], Any], gaussian: Gaussian) -> Gaussian:
     return Gaussian(value, matmul(matmul(jacobian, gaussian.covariance), jacobian.T))
 
 
-@eqx.filter_jit
+@filter_jit
 def propagate_unscented(
     f: Callable[[Any], Any], gaussian: Gaussian, *, alpha: float = 1.0, beta: float = 0.0, kappa: float | None = None
 ) -> Gaussian:
@@ -97,7 +97,7 @@ def propagate_unscented(
     return _moments(samples, first, jnp.asarray(weights, dtype), jnp.asarray(weights_covariance, dtype))
 
 
-@eqx.filter_jit
+@filter_jit
 def propagate_sampled(
     f: Callable[[Any], Any], gaussian: Gaussian, *, key: Key[Array, ""], num_samples: int = 256
 ) -> Gaussian:

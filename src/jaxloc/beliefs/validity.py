@@ -39,6 +39,8 @@ def neutral(value: Any) -> Any:
 def finite_or_neutral(value: Any) -> Any:
     """The pytree with zero in place of non-finite numbers, and the identity in place of poses that hold one.
 
+    Python numbers become arrays, weakly typed.
+
     Example:
         >>> import jax.numpy as jnp, jaxloc as jl
         >>> pose, speed = finite_or_neutral((jl.poses.SE2(1.0, 2.0, jnp.nan), jnp.array([jnp.nan, 1.0])))
@@ -48,7 +50,7 @@ def finite_or_neutral(value: Any) -> Any:
 
     def replace(node):
         if not isinstance(node, Group | Direction):
-            return tree.finite_or_zero(node)
+            return tree.finite_or_zero(jnp.asarray(node))
         depth = len(node.batch_shape)
         good = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(depth, leaf.ndim))) for leaf in jax.tree.leaves(node)]
         good = jnp.all(jnp.stack(good), axis=0)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _linalg
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import chi2_cdf, chi2_quantile
 from jaxloc.poses import Trajectory
 
@@ -58,7 +59,7 @@ class Calibration(eqx.Module):
     count: Int[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 def nees(error: Float[Array, " d"], covariance: Float[Array, "d d"]) -> SquaredErrors:
     """Normalized estimation error squared: ``e^T P^-1 e``.
 
@@ -84,7 +85,7 @@ def nees(error: Float[Array, " d"], covariance: Float[Array, "d d"]) -> SquaredE
     return SquaredErrors(jnp.sum(whitened**2), ok)
 
 
-@eqx.filter_jit
+@filter_jit
 def nis(innovation: Float[Array, " d"], covariance: Float[Array, "d d"]) -> SquaredErrors:
     """Normalized innovation squared: ``v^T S^-1 v``, which needs no truth.
 
@@ -105,7 +106,7 @@ def nis(innovation: Float[Array, " d"], covariance: Float[Array, "d d"]) -> Squa
     return nees(innovation, covariance)
 
 
-@eqx.filter_jit
+@filter_jit
 def trajectory_nees(estimate: Trajectory, covariances: Float[Array, "n d d"], truth: Trajectory) -> SquaredErrors:
     """:func:`nees` of every pose of a path, in the right tangent space of the estimate.
 
@@ -127,7 +128,7 @@ def trajectory_nees(estimate: Trajectory, covariances: Float[Array, "n d d"], tr
     return jax.vmap(nees)(errors, covariances)
 
 
-@eqx.filter_jit
+@filter_jit
 def mean_bounds(degrees_of_freedom: int, num_values: int, *, confidence: float | Float[Array, ""] = 0.95) -> Interval:
     """Confidence interval of the mean of independent NEES or NIS values of a consistent estimator.
 
@@ -152,7 +153,7 @@ def mean_bounds(degrees_of_freedom: int, num_values: int, *, confidence: float |
     return Interval(chi2_quantile(tail, dof) / num_values, chi2_quantile(1.0 - tail, dof) / num_values)
 
 
-@eqx.filter_jit
+@filter_jit
 def coverage(
     squared: SquaredErrors, degrees_of_freedom: int, *, probabilities: tuple[float, ...] = (0.5, 0.9, 0.95)
 ) -> Float[Array, " k"]:
@@ -177,7 +178,7 @@ def coverage(
     return jnp.sum(inside, axis=1).astype(values.dtype) / jnp.maximum(jnp.sum(ok), 1).astype(values.dtype)
 
 
-@eqx.filter_jit
+@filter_jit
 def calibration(
     squared: SquaredErrors,
     degrees_of_freedom: int,

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from jaxloc._jit import filter_jit
 from jaxloc.poses.lie_group import as_floats
 
 
@@ -58,7 +59,7 @@ class Quadrature(Combination):
         return (sigma**2 / (2.0 * k**2 * way)) ** (1.0 / 3.0)
 
 
-@eqx.filter_jit
+@filter_jit
 def expected_error(
     spacing: Float[Array, "*n"], *, sigma: Any, k: Any, way: Any, combination: Combination = PlainSum()
 ) -> Float[Array, "*n"]:
@@ -86,7 +87,7 @@ def expected_error(
     return combination.combine(sigma * jnp.sqrt(way / spacing), k * way * spacing)
 
 
-@eqx.filter_jit
+@filter_jit
 def best_spacing(*, sigma: Any, k: Any, way: Any, combination: Combination = PlainSum()) -> Float[Array, ""]:
     """The spacing of updates with the least expected error.
 
@@ -121,7 +122,7 @@ class Drift(eqx.Module):
     offset: Float[Array, "*n"]
 
 
-@eqx.filter_jit
+@filter_jit
 def simulate_drift(
     counts: Float[Array, " n"],
     *,
@@ -175,7 +176,7 @@ def simulate_drift(
     return jax.lax.map(lambda pair: drives(*pair), (counts, jax.random.split(key, counts.shape[0])))
 
 
-@eqx.filter_jit
+@filter_jit
 def find_minimum(spacing: Float[Array, " n"], error: Float[Array, " n"]) -> Float[Array, ""]:
     """Minimum of a noisy error curve, by a cubic fit of the logarithms.
 

@@ -2,13 +2,13 @@
 
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.features.harris import Box
 from jaxloc.features.keypoints import Descriptors, Keypoints
@@ -17,7 +17,7 @@ from jaxloc.features.keypoints import Descriptors, Keypoints
 SIDE, _MEAN = 31, 5
 
 
-@eqx.filter_jit
+@filter_jit
 def intensity_centroid(image: Float[Array, "h w"], uv: Float[Array, "n 2"], *, radius: int = 15) -> Float[Array, " n"]:
     """Orientation by the intensity centroid of a disc around a corner, ``atan2(m01, m10)``.
 
@@ -67,7 +67,7 @@ def _half_widths(radius: int) -> list[int]:
     return widths
 
 
-@eqx.filter_jit
+@filter_jit
 def draw_tests(key: Array, *, count: int = 256) -> Int[Array, "count 4"]:
     """Random pairs of pixels in a patch of 31 x 31, normal about the center with a fifth of the side as deviation.
 
@@ -91,7 +91,7 @@ def draw_tests(key: Array, *, count: int = 256) -> Int[Array, "count 4"]:
     return jnp.clip(places, -reach, reach).astype(jnp.int32)
 
 
-@eqx.filter_jit
+@filter_jit
 def compare(image: Float[Array, "h w"], keypoints: Keypoints, tests: Int[Array, "t 4"]) -> Bool[Array, "n t"]:
     """BRIEF tests: whether the first pixel of each pair is darker than the second, rotated with the keypoint.
 
@@ -130,7 +130,7 @@ def _places(keypoints: Keypoints, tests: Int[Array, "t 4"]) -> tuple[Int[Array, 
     return jnp.round(u).astype(jnp.int32), jnp.round(v).astype(jnp.int32)
 
 
-@eqx.filter_jit
+@filter_jit
 def brief(image: Float[Array, "h w"], keypoints: Keypoints, tests: Int[Array, "t 4"]) -> Descriptors:
     """BRIEF descriptors: bits of all tests, packed as in OpenCV, the first in the lowest bit.
 
@@ -167,7 +167,7 @@ def brief(image: Float[Array, "h w"], keypoints: Keypoints, tests: Int[Array, "t
     return Descriptors(jnp.where(valid[:, None], values, jnp.zeros((), jnp.uint8)), valid)
 
 
-@eqx.filter_jit
+@filter_jit
 def select_tests(bits: Bool[Array, "m k"], *, count: int = 256, limit: float = 0.2) -> Int[Array, " count"]:
     """Selects tests of low correlation and means near a half, as rBRIEF was learned.
 

@@ -2,11 +2,11 @@
 
 import functools
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.features.keypoints import Keypoints
 
 # The circle of radius three, (right, down), clockwise from the top.
@@ -17,7 +17,7 @@ CIRCLE = (
 _RADIUS, _SIZE = 3, 7.0
 
 
-@eqx.filter_jit
+@filter_jit
 def segment_score(image: Float[Array, "h w"], *, arc: int = 9) -> Float[Array, "h w"]:
     """FAST score: the greatest threshold at which a pixel is a corner.
 
@@ -72,7 +72,7 @@ def _least_of_arcs(values: list[Array], arc: int) -> list[Array]:
     return [jnp.minimum(least[k], least[(k + rest) % 16]) for k in range(16)] if rest else least
 
 
-@eqx.filter_jit
+@filter_jit
 def suppress_non_maxima(score: Float[Array, "h w"]) -> Float[Array, "h w"]:
     """Non-maximum suppression: scores not above those of all eight neighbors become zero, equal neighbors too.
 
@@ -119,7 +119,7 @@ def fast(
     return _fast(image, jnp.asarray(threshold, image.dtype), arc, capacity)
 
 
-@eqx.filter_jit
+@filter_jit
 def _fast(image: Array, threshold: Array, arc: int, capacity: int) -> Keypoints:
     score = segment_score(image, arc=arc)
     return strongest_keypoints(suppress_non_maxima(jnp.where(score > threshold, score, 0.0)), capacity)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.gradients import convolve_columns, convolve_rows, smooth, sobel
 
 
@@ -76,7 +77,7 @@ class SubpixelPeaks(eqx.Module):
     ok: Bool[Array, " n"]
 
 
-@eqx.filter_jit
+@filter_jit
 def structure_tensor(image: Float[Array, "h w"], *, window: AbstractWindow | None = None) -> StructureTensor:
     """Averages products of the (Sobel) derivatives over a window.
 
@@ -132,13 +133,13 @@ def harris(
     return _harris(structure_tensor(image, window=window), jnp.asarray(k, image.dtype))
 
 
-@eqx.filter_jit
+@filter_jit
 def _harris(tensor: StructureTensor, k: Float[Array, ""]) -> Float[Array, "h w"]:
     trace = tensor.uu + tensor.vv
     return tensor.uu * tensor.vv - tensor.uv * tensor.uv - k * trace * trace
 
 
-@eqx.filter_jit
+@filter_jit
 def shi_tomasi(image: Float[Array, "h w"], *, window: AbstractWindow | None = None) -> Float[Array, "h w"]:
     """The smaller eigenvalue of M, `(uu + vv) / 2 - sqrt(((uu - vv) / 2)^2 + uv^2)`.
 
@@ -182,7 +183,7 @@ def classify(response: Float[Array, "h w"], threshold: float | Float[Array, ""])
     return (response > threshold).astype(jnp.int32) - (response < -threshold).astype(jnp.int32)
 
 
-@eqx.filter_jit
+@filter_jit
 def refine_peaks(response: Float[Array, "h w"], uv: Float[Array, "n 2"]) -> SubpixelPeaks:
     """Moves peaks to the maximum of the quadratic model of the 3x3 responses around each.
 

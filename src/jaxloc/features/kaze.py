@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.features.keypoints import Descriptors, Keypoints
 from jaxloc.features.scale_space.extrema import ExtremumTest, find_extrema
 from jaxloc.features.scale_space.nonlinear import NonlinearScaleSpace, Stack, nonlinear_scale_space
@@ -102,7 +103,7 @@ class Kaze(eqx.Module):
     upright: bool = eqx.field(static=True, default=False)
 
 
-@eqx.filter_jit
+@filter_jit
 def kaze(image: Float[Array, "h w"], *, options: Kaze = Kaze(), capacity: int = 1000) -> tuple[Keypoints, Descriptors]:
     """KAZE keypoints with scale and orientation, and their descriptors.
 
@@ -137,7 +138,7 @@ def kaze(image: Float[Array, "h w"], *, options: Kaze = Kaze(), capacity: int = 
     return keypoints, _describe(samples, keypoints, options)
 
 
-@eqx.filter_jit
+@filter_jit
 def describe_kaze(image: Float[Array, "h w"], keypoints: Keypoints, *, options: Kaze = Kaze()) -> Descriptors:
     """KAZE descriptors of given keypoints with size and orientation.
 

@@ -1,15 +1,15 @@
 """Descriptor matching: distances of all pairs, geometric gates, ratio test and mutual consistency."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, UInt8
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.features.keypoints import Descriptors, Matches, Nearest
 
 
-@eqx.filter_jit
+@filter_jit
 def hamming_distances(first: UInt8[Array, "n d"], second: UInt8[Array, "m d"]) -> Float[Array, "n m"]:
     """Hamming distances of all pairs of packed binary descriptors.
 
@@ -31,7 +31,7 @@ def hamming_distances(first: UInt8[Array, "n d"], second: UInt8[Array, "m d"]) -
     return bits.astype(jnp.float32)
 
 
-@eqx.filter_jit
+@filter_jit
 def euclidean_distances(first: Float[Array, "n d"], second: Float[Array, "m d"]) -> Float[Array, "n m"]:
     """Euclidean distances of all pairs by one matrix product, `|a - b|^2 = |a|^2 + |b|^2 - 2 a.b`.
 
@@ -106,7 +106,7 @@ def window_gate(
     return _window_gate(uv_predicted, uv, jnp.asarray(radius, uv.dtype))
 
 
-@eqx.filter_jit
+@filter_jit
 def nearest(distances: Float[Array, "n m"], allowed: Bool[Array, "n m"], *, axis: int = 1) -> Nearest:
     """Nearest and second nearest allowed candidate of every row (or column).
 
@@ -223,20 +223,20 @@ def match(
     return _match(first, second, gate, *limits, mutual)
 
 
-@eqx.filter_jit
+@filter_jit
 def _row_gate(uv_left, uv_right, tolerance, lowest, highest) -> Bool[Array, "n m"]:
     shift = uv_left[:, 0][:, None] - uv_right[:, 0][None, :]
     rows = jnp.abs(uv_left[:, 1][:, None] - uv_right[:, 1][None, :])
     return (rows <= tolerance) & (shift > lowest) & (shift <= highest)
 
 
-@eqx.filter_jit
+@filter_jit
 def _window_gate(uv_predicted, uv, radius) -> Bool[Array, "n m"]:
     away = jnp.abs(uv_predicted[:, None, :] - uv[None, :, :])
     return (away[..., 0] <= radius) & (away[..., 1] <= radius)
 
 
-@eqx.filter_jit
+@filter_jit
 def _match(first: Descriptors, second: Descriptors, gate, max_distance, ratio, mutual: bool) -> Matches:
     measure = hamming_distances if first.values.dtype == jnp.uint8 else euclidean_distances
     distances = measure(first.values, second.values)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.features.brief import SIDE, brief, draw_tests, intensity_centroid
 from jaxloc.features.fast import segment_score, strongest_keypoints, suppress_non_maxima
 from jaxloc.features.keypoints import Descriptors, Keypoints
@@ -38,7 +39,7 @@ class Orb(eqx.Module):
         return sizes[:1] + [size for size in sizes[1:] if min(size) > 2 * SIDE]
 
 
-@eqx.filter_jit
+@filter_jit
 def orb(
     image: Float[Array, "h w"],
     *,

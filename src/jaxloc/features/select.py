@@ -5,6 +5,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
+
 # Bisections of the side of the square in `cover_squares`.
 _BISECTIONS = 12
 
@@ -49,7 +51,7 @@ class Coverage(eqx.Module):
     entropy: Float[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 def select_by_grid(
     uv: Float[Array, "n 2"],
     score: Float[Array, " n"],
@@ -130,7 +132,7 @@ def local_peaks(
     return _local_peaks(response, grid, per_cell, radius, jnp.asarray(threshold, response.dtype))
 
 
-@eqx.filter_jit
+@filter_jit
 def _local_peaks(response, grid: tuple[int, int], per_cell: int, radius: int, threshold) -> Peaks:
     side = 2 * radius + 1
     highest = lax.reduce_window(response, -jnp.inf, lax.max, (side, side), (1, 1), "SAME")
@@ -147,7 +149,7 @@ def _local_peaks(response, grid: tuple[int, int], per_cell: int, radius: int, th
     return Peaks(jnp.where(valid[:, None], uv, 0.0), jnp.where(valid, best.reshape(-1), 0.0), valid)
 
 
-@eqx.filter_jit
+@filter_jit
 def coverage(
     uv: Float[Array, "n 2"], valid: Bool[Array, " n"], *, shape: tuple[int, int], grid: tuple[int, int]
 ) -> Coverage:
@@ -194,7 +196,7 @@ def cells(uv: Float[Array, "n 2"], *, shape: tuple[int, int], grid: tuple[int, i
     return row * grid[1] + column
 
 
-@eqx.filter_jit
+@filter_jit
 def cover_squares(
     uv: Float[Array, "n 2"],
     score: Float[Array, " n"],

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.features.keypoints import Descriptors, Keypoints
 from jaxloc.features.scale_space.extrema import ExtremumTest, find_extrema
 from jaxloc.features.scale_space.gaussian import Octave, ScaleSpace, octaves
@@ -54,7 +55,7 @@ class Sift(eqx.Module):
     second_peak: float = eqx.field(static=True, default=0.8)
 
 
-@eqx.filter_jit
+@filter_jit
 def sift(image: Float[Array, "h w"], *, options: Sift = Sift(), capacity: int = 1000) -> tuple[Keypoints, Descriptors]:
     """SIFT keypoints with scale and orientation, and their descriptors.
 
@@ -93,7 +94,7 @@ def sift(image: Float[Array, "h w"], *, options: Sift = Sift(), capacity: int = 
     return keypoints, _describe(gradients, keypoints, options.scales)
 
 
-@eqx.filter_jit
+@filter_jit
 def describe_sift(
     image: Float[Array, "h w"], keypoints: Keypoints, *, scales: ScaleSpace = ScaleSpace()
 ) -> Descriptors:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.interpolation import AbstractInterpolation, Bilinear, inside_image
 from jaxloc.images.patches import extract, slice_windows
 
@@ -136,13 +137,13 @@ def refine_translation(
     return _refine_translation(previous, current, uv_previous, initial, options)
 
 
-@eqx.filter_jit
+@filter_jit
 def _refine_stereo(left, right, uv_left, initial, options: PatchRefinement) -> RefinedPoints:
     initial = jnp.stack([initial[:, 0], uv_left[:, 1]], axis=1)
     return _fit(right, _template(left, uv_left, 1, options), initial, 1, options)
 
 
-@eqx.filter_jit
+@filter_jit
 def _refine_translation(previous, current, uv_previous, initial, options: PatchRefinement) -> RefinedPoints:
     return _fit(current, _template(previous, uv_previous, 2, options), initial, 2, options)
 

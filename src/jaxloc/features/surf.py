@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.features.keypoints import Descriptors, Keypoints
 from jaxloc.features.scale_space.box_hessian import box_hessian, filter_scale, filter_sizes, max_octaves
 from jaxloc.features.scale_space.extrema import ExtremumTest, find_extrema
@@ -41,7 +42,7 @@ class Surf(eqx.Module):
     upright: bool = eqx.field(static=True, default=False)
 
 
-@eqx.filter_jit
+@filter_jit
 def surf(image: Float[Array, "h w"], *, options: Surf = Surf(), capacity: int = 1000) -> tuple[Keypoints, Descriptors]:
     """SURF keypoints with scale, orientation and sign of the Laplacian, and their descriptors.
 
@@ -76,7 +77,7 @@ def surf(image: Float[Array, "h w"], *, options: Surf = Surf(), capacity: int = 
     return keypoints, _describe(image, keypoints)
 
 
-@eqx.filter_jit
+@filter_jit
 def describe_surf(image: Float[Array, "h w"], keypoints: Keypoints) -> Descriptors:
     """SURF descriptors of given keypoints with size and orientation.
 
@@ -103,7 +104,7 @@ def describe_surf(image: Float[Array, "h w"], keypoints: Keypoints) -> Descripto
     return _describe(jnp.where(jnp.isfinite(image), image, 0.0), keypoints)
 
 
-@eqx.filter_jit
+@filter_jit
 def laplacian_gate(first: Keypoints, second: Keypoints) -> Bool[Array, "n m"]:
     """Pairs of SURF keypoints whose signs of the Laplacian agree: both dark on bright, or both bright on dark.
 

@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import Gaussian, validity
 from jaxloc.beliefs.square_root import cholesky, product, triangularize, whiten
 from jaxloc.filters.interface import Filter, FilterState, GaussianInfo, GaussianState, History, Info, conclude
@@ -167,7 +168,7 @@ def _updated(
     return info.ok & tree.all_finite((after, info)), (after, info)
 
 
-@eqx.filter_jit
+@filter_jit
 def smooth_interacting(
     filt: InteractingMultipleModel, history: History, controls: Any, *, active: Bool[Array, " t"] | None = None
 ) -> InteractingState:

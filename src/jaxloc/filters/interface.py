@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian
 
@@ -130,7 +131,7 @@ def _identity(state: Any) -> Any:
     return state
 
 
-@eqx.filter_jit
+@filter_jit
 def run(
     filt: Filter,
     state: Any,

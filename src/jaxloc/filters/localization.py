@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import Gaussian, KLDSize, Motion, Particles, Sensor, validity
 from jaxloc.beliefs.particles import finite_log_weights
 from jaxloc.beliefs.resampling.indices import systematic
@@ -174,24 +175,24 @@ class MonteCarloLocalization(Filter):
         dtype, zero = prior.log_weights.dtype, jnp.zeros((), jnp.int32)
         return LocalizationState(prior.usable().normalize(), jnp.zeros(2, dtype), jnp.zeros((), dtype), zero, zero)
 
-    @eqx.filter_jit
+    @filter_jit
     def init_globally(self, num_particles: int, *, key: Key[Array, ""]) -> LocalizationState:
         """Particles evenly distributed over the free space and all headings [R-11]."""
         return self.init(Particles(self.space.sample_evenly(num_particles, key=key)))
 
-    @eqx.filter_jit
+    @filter_jit
     def init_near(self, pose: Gaussian, num_particles: int, *, key: Key[Array, ""]) -> LocalizationState:
         """Particles about a known pose."""
         return self.init(Particles.from_gaussian(pose, num_particles, key=key))
 
-    @eqx.filter_jit
+    @filter_jit
     def resize(self, state: LocalizationState, num_particles: int, *, key: Key[Array, ""]) -> LocalizationState:
         """The same density with more or fewer particles: few suffice once the pose is known."""
         indices = systematic(key, finite_log_weights(state.particles), num_particles)
         particles = Particles(state.particles.take(indices)).normalize()
         return LocalizationState(particles, state.fit, state.inject, state.seen, state.step)
 
-    @eqx.filter_jit
+    @filter_jit
     def predict(
         self, state: LocalizationState, control: Any, *, key: Key[Array, ""] | None = None
     ) -> LocalizationState:
@@ -223,7 +224,7 @@ class MonteCarloLocalization(Filter):
         after = LocalizationState(particles, state.fit, jnp.zeros_like(state.inject), state.seen, state.step + 1)
         return ok, after
 
-    @eqx.filter_jit
+    @filter_jit
     def update(
         self, state: LocalizationState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[LocalizationState, LocalizationInfo]:
@@ -313,7 +314,7 @@ class MonteCarloLocalization(Filter):
         return Particles(values, jnp.where(chosen, level, particles.log_weights), particles.valid | chosen).normalize()
 
 
-@eqx.filter_jit
+@filter_jit
 def find_place(
     particles: Particles, *, radius: float | Float[Array, ""] = 1.0, angle: float | Float[Array, ""] = 0.7
 ) -> Place:

@@ -11,6 +11,7 @@ from jax.sharding import AxisType
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import Motion, Particles, Sensor, validity
 from jaxloc.beliefs.kld_sampling import KLDSize
 from jaxloc.beliefs.particles import NOTHING
@@ -127,7 +128,7 @@ class ParticleFilter(Filter):
         noise, zero = self.proposal.init_noise(prior.usable().values), jnp.zeros((), jnp.int32)
         return ParticleState(prior.usable().normalize(), indices, jnp.zeros((), bool), noise, zero)
 
-    @eqx.filter_jit
+    @filter_jit
     def predict(self, state: ParticleState, control: Any, *, key: Key[Array, ""] | None = None) -> ParticleState:
         """The particles one step ahead, resampled if needed.
 
@@ -152,7 +153,7 @@ class ParticleFilter(Filter):
         particles = Particles(values, log_weights, choice.particles.valid)
         return ok, ParticleState(particles, choice.ancestors, choice.resampled, drawn.noise, state.step + 1)
 
-    @eqx.filter_jit
+    @filter_jit
     def update(
         self, state: ParticleState, measurement: Any, valid: Bool[Array, "*m"], *, key: Key[Array, ""] | None = None
     ) -> tuple[ParticleState, ParticleInfo]:

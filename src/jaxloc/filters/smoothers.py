@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import back_substitution
 from jaxloc.beliefs import validity
 from jaxloc.beliefs.square_root import product, triangularize
@@ -31,7 +32,7 @@ class ReverseStep(eqx.Module):
     rest: Float[Array, "*t d d"]
 
 
-@eqx.filter_jit
+@filter_jit
 def smooth(
     filt: GaussianFilter, history: History, controls: Any, *, active: Bool[Array, " t"] | None = None
 ) -> GaussianState:
@@ -80,7 +81,7 @@ def smooth(
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), smoothed, last)
 
 
-@eqx.filter_jit
+@filter_jit
 def smooth_fixed_lag(
     filt: GaussianFilter, history: History, controls: Any, lag: int, *, active: Bool[Array, " t"] | None = None
 ) -> GaussianState:

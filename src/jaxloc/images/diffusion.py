@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.gradients import scharr, smooth
 
 # Largest stable explicit step of the five-point scheme, for conductivities up to one.
@@ -66,7 +67,7 @@ class Linear(Conductivity):
 _PERONA_MALIK = PeronaMalik()
 
 
-@eqx.filter_jit
+@filter_jit
 def contrast(
     image: Float[Array, "h w"], *, percentile: float | Float[Array, ""] = 70.0, sigma: float = 1.0
 ) -> Float[Array, ""]:
@@ -98,7 +99,7 @@ def contrast(
     return jnp.where(jnp.isfinite(found), found, 1.0)
 
 
-@eqx.filter_jit
+@filter_jit
 def conductance(
     image: Float[Array, "h w"],
     contrast: Float[Array, ""],
@@ -173,7 +174,7 @@ def _flow(image: Float[Array, "h w"], conductance: Float[Array, "h w"]) -> Float
     return across + jnp.pad(down, ((0, 1), (0, 0))) - jnp.pad(down, ((1, 0), (0, 0)))
 
 
-@eqx.filter_jit
+@filter_jit
 def diffuse_explicit(
     image: Float[Array, "h w"], conductance: Float[Array, "h w"], steps: Float[Array, " n"]
 ) -> Float[Array, "h w"]:
@@ -194,7 +195,7 @@ def diffuse_explicit(
     return lax.scan(lambda now, step: (now + step * _flow(now, conductance), None), image, steps)[0]
 
 
-@eqx.filter_jit
+@filter_jit
 def diffuse_implicit(
     image: Float[Array, "h w"], conductance: Float[Array, "h w"], step: Float[Array, ""]
 ) -> Float[Array, "h w"]:
@@ -244,7 +245,7 @@ def _solve_lines(image: Float[Array, "h w"], conductance: Float[Array, "h w"], s
     return lax.scan(substitute, zero, (ratios, values), reverse=True)[1]
 
 
-@eqx.filter_jit
+@filter_jit
 def diffuse(
     image: Float[Array, "h w"], *, sigma: float, kind: Conductivity = _PERONA_MALIK, cycles: int = 4
 ) -> Float[Array, "h w"]:

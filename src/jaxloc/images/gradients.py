@@ -6,6 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._jit import filter_jit
+
 
 class ImageGradient(eqx.Module):
     """First derivatives of an image in gray levels a pixel.
@@ -19,7 +21,7 @@ class ImageGradient(eqx.Module):
     down: Float[Array, "h w"]
 
 
-@eqx.filter_jit
+@filter_jit
 def central_difference(image: Float[Array, "h w"]) -> ImageGradient:
     """Differentiates by `(I[x + 1] - I[x - 1]) / 2`.
 
@@ -38,7 +40,7 @@ def central_difference(image: Float[Array, "h w"]) -> ImageGradient:
     return _derivative(image, (0.0, 1.0, 0.0))
 
 
-@eqx.filter_jit
+@filter_jit
 def sobel(image: Float[Array, "h w"]) -> ImageGradient:
     """Differentiates with Sobel's 3x3 kernel, scaled to gray levels a pixel: `cv2.Sobel(ksize=3) / 8`.
 
@@ -57,7 +59,7 @@ def sobel(image: Float[Array, "h w"]) -> ImageGradient:
     return _derivative(image, (0.25, 0.5, 0.25))
 
 
-@eqx.filter_jit
+@filter_jit
 def scharr(image: Float[Array, "h w"]) -> ImageGradient:
     """Differentiates with Scharr's 3x3 kernel, scaled to gray levels a pixel: `cv2.Scharr / 32`.
 
@@ -79,7 +81,7 @@ def scharr(image: Float[Array, "h w"]) -> ImageGradient:
     return _derivative(image, (3.0 / 16.0, 10.0 / 16.0, 3.0 / 16.0))
 
 
-@eqx.filter_jit
+@filter_jit
 def smooth(
     image: Float[Array, "h w"], sigma: float | int | Float[Array, ""], *, radius: int | None = None
 ) -> Float[Array, "h w"]:

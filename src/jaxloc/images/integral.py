@@ -3,13 +3,14 @@
 from collections.abc import Callable
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Num
 
+from jaxloc._jit import filter_jit
 
-@eqx.filter_jit
+
+@filter_jit
 def integral(image: Num[Array, "h w"]) -> Num[Array, "h1 w1"]:
     """Integral image: sums over all pixels above and to the left, ``S[i, j] = sum of image[:i, :j]``.
 
@@ -35,7 +36,7 @@ def integral(image: Num[Array, "h w"]) -> Num[Array, "h1 w1"]:
     return jnp.pad(jnp.cumsum(jnp.cumsum(image, axis=0), axis=1), ((1, 0), (1, 0)))
 
 
-@eqx.filter_jit
+@filter_jit
 def box_sums(sums: Num[Array, "h1 w1"], boxes: Int[Array, "n 4"]) -> Num[Array, " n"]:
     """Sums over rectangles of any size, by four reads each.
 

@@ -6,6 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
+
 
 class Sampled(eqx.Module):
     """Values of an image at a set of pixel coordinates.
@@ -74,7 +76,7 @@ class Bicubic(AbstractInterpolation):
         return ((self.a + 2.0) * t - (self.a + 3.0)) * t * t + 1.0
 
 
-@eqx.filter_jit
+@filter_jit
 def sample(
     image: Float[Array, "h w *c"], uv: Float[Array, "n 2"], *, method: AbstractInterpolation | None = None
 ) -> Sampled:

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.gradients import convolve_columns, convolve_rows, pad_reflected
 
 
@@ -44,7 +45,7 @@ def as_gray(image: Num[Array, "h w"] | Any, dtype: Any = None) -> Float[Array, "
     return image.astype(dtype)
 
 
-@eqx.filter_jit
+@filter_jit
 def standardize(image: Float[Array, "h w"], *, valid: Bool[Array, "h w"] | None = None) -> Float[Array, "h w"]:
     """Normalizes to zero mean and unit variance over the valid pixels: equal for ``I`` and ``a I + b``, a > 0.
 
@@ -68,7 +69,7 @@ def standardize(image: Float[Array, "h w"], *, valid: Bool[Array, "h w"] | None 
     return jnp.where(textured, centered / jnp.sqrt(jnp.where(textured, variance, 1.0)), 0.0)
 
 
-@eqx.filter_jit
+@filter_jit
 def standardize_locally(image: Float[Array, "h w"], *, radius: int = 8, floor: float = 1.0) -> Float[Array, "h w"]:
     """Local normalization to zero mean and unit variance over a square around every pixel.
 
@@ -97,7 +98,7 @@ def standardize_locally(image: Float[Array, "h w"], *, radius: int = 8, floor: f
     return (image - local) / jnp.sqrt(variance + floor**2)
 
 
-@eqx.filter_jit
+@filter_jit
 def fit_gain_bias(
     image: Float[Array, "h w"], reference: Float[Array, "h w"], *, valid: Bool[Array, "h w"] | None = None
 ) -> GainBias:
@@ -130,7 +131,7 @@ def fit_gain_bias(
     return GainBias(gain, total / count, ok)
 
 
-@eqx.filter_jit
+@filter_jit
 def rank_transform(image: Float[Array, "h w"], *, radius: int = 3) -> Float[Array, "h w"]:
     """Rank transform: fraction of darker neighbors in a square; invariant to increasing maps of gray levels.
 

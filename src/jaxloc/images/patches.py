@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.interpolation import AbstractInterpolation, Bilinear
 
 
@@ -21,7 +22,7 @@ class Patches(eqx.Module):
     inside: Bool[Array, " n"]
 
 
-@eqx.filter_jit
+@filter_jit
 def extract(
     image: Float[Array, "h w"],
     uv: Float[Array, "n 2"],

@@ -1,15 +1,15 @@
 """Gaussian image pyramids; a pixel `uv` of level `k` is the pixel `uv * 2**k` of the image."""
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc._xla import compute_once
 from jaxloc.images.gradients import pad_reflected
 
 _BINOMIAL = (1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0)
 
 
-@eqx.filter_jit
+@filter_jit
 def halve(image: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
     """Smooths with the binomial kernel (1, 4, 6, 4, 1) / 16 and keeps every second row and column, as `cv2.pyrDown`.
 
@@ -32,7 +32,7 @@ def halve(image: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
     return compute_once(_halve_columns, compute_once(_halve_rows, image))
 
 
-@eqx.filter_jit
+@filter_jit
 def gaussian_pyramid(image: Float[Array, "h w"], *, levels: int) -> tuple[Float[Array, "_ _"], ...]:
     """Builds the image at full, half, quarter, ... size.
 

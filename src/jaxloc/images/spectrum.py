@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.interpolation import Bilinear, sample
 
 
@@ -21,7 +22,7 @@ def hann(shape: tuple[int, int], dtype: Any = float) -> Float[Array, "h w"]:
     return rows[:, None] * columns[None, :]
 
 
-@eqx.filter_jit
+@filter_jit
 def amplitude(image: Float[Array, "h w"]) -> Float[Array, "h w"]:
     """Amplitude spectrum ``|fft2(image)|``, invariant to circular shifts.
 

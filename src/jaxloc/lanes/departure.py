@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.lanes.lane import Lane
 from jaxloc.poses.lie_group import as_floats
 
@@ -24,7 +25,7 @@ class LineCrossing(eqx.Module):
     inside: Bool[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 def time_to_line_crossing(
     lane: Lane, lane_width: Any = 3.6, vehicle_width: Any = 1.8, speed: Any = 20.0, *, horizon: Any = 200.0
 ) -> LineCrossing:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.interpolation import Bilinear, sample_components
 from jaxloc.images.normalization import as_gray
 from jaxloc.poses.lie_group import as_floats
@@ -135,7 +136,7 @@ def halve_columns(
     return jnp.where(whole, smooth, 0.0), whole
 
 
-@eqx.filter_jit
+@filter_jit
 def inverse_perspective(ground: GroundCamera, image: Num[Array, "h w"], grid: GroundGrid) -> GroundView:
     """Inverse perspective mapping: samples an image at the projections of the points of a ground grid.
 

@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.features import subpixel
 from jaxloc.features.opencv import backend
 
@@ -248,7 +249,7 @@ def match(
     return matcher.match(left, right)
 
 
-@eqx.filter_jit
+@filter_jit
 def _match_blocks(left: Array, right: Array, options: BlockMatching) -> DisparityMap:
     finite = jnp.isfinite(left) & jnp.isfinite(right)
     left, right = (jnp.where(jnp.isfinite(image), image, 0.0) for image in (left, right))
@@ -331,7 +332,7 @@ class DenseRefinement(eqx.Module):
     most: float = eqx.field(static=True, default=0.5)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def refine(
     left: Float[Array, "h w"],

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc import _linalg
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3, Direction
 from jaxloc.poses.lie_group import skew
@@ -71,7 +72,7 @@ def homogeneous(points: Float[Array, "n 2"]) -> Float[Array, "3 n"]:
     return jnp.concatenate([points.T, jnp.ones_like(points.T[:1])])
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def epipolar_lines(matrix: Float[Array, "3 3"], second: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
     """Lines ``a u + b v + c = 0`` of the first image on which points of the second lie; ``a^2 + b^2 = 1``.
@@ -92,7 +93,7 @@ def epipolar_lines(matrix: Float[Array, "3 3"], second: Float[Array, "n 2"]) -> 
     return (lines / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))[None, :]).T
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def epipoles(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Images of each camera's center in the other view: unit homogeneous points with ``e1^T M = 0``, ``M e2 = 0``.
@@ -182,7 +183,7 @@ def sampson_components(matrix: Array, x1: Float[Array, "3 n"], x2: Float[Array, 
     return jnp.where(some, error, 0.0) / jnp.sqrt(jnp.where(some, squared, 1.0))
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def sampson_distance(
     matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "n 2"]
@@ -207,7 +208,7 @@ def sampson_distance(
     return sampson_components(matrix, homogeneous(first), homogeneous(second))
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def symmetric_distance(
     matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "n 2"]
@@ -231,7 +232,7 @@ def symmetric_distance(
     return jnp.where(some, jnp.sqrt(jnp.where(some, squared, 1.0)), 0.0)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def epipolar_gate(
     matrix: Float[Array, "3 3"], first: Float[Array, "n 2"], second: Float[Array, "m 2"], *, band: Any = 2.0

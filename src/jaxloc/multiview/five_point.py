@@ -8,7 +8,6 @@ eigenvalues of a companion matrix, which accelerators lack; Newton steps on the 
 import itertools
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc import _linalg
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.multiview.epipolar import RelativePose, depth_signs, null_vector, unit_rays
 from jaxloc.poses import SO3, Direction, retract
@@ -59,7 +59,7 @@ class RelativePoses(NamedTuple):
     valid: Bool[Array, " k"]
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def five_point(first: Float[Array, "5 3"], second: Float[Array, "5 3"]) -> RelativePoses:
     """Relative poses of two calibrated views of five points: up to ten essential matrices.

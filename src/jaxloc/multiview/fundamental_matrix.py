@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc import _linalg
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.multiview.epipolar import homogeneous
 from jaxloc.multiview.homography import normalizer
@@ -47,7 +48,7 @@ class FundamentalMatrices(eqx.Module):
     valid: Bool[Array, "3"]
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def eight_point(
     first: Float[Array, "n 2"],
@@ -109,7 +110,7 @@ def eight_point(
     return FundamentalMatrix(jnp.where(ok, matrix, lax.stop_gradient(matrix)), separation, ok)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def seven_point(first: Float[Array, "7 2"], second: Float[Array, "7 2"]) -> FundamentalMatrices:
     """Seven-point algorithm: one to three fundamental matrices.

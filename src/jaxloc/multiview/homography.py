@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from jaxloc import _linalg
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc._tree import detach_unless
 from jaxloc.images import Homography
@@ -26,7 +27,7 @@ _TUKEY = 5.12
 _SAMPLE = 4
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def plane_homography(
     first: Pinhole, second: Pinhole, T_first_second: SE3, normal: Direction, distance: Float[Array, ""]
@@ -130,7 +131,7 @@ def _inverse(camera: Pinhole) -> Float[Array, "3 3"]:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def four_points(first: Float[Array, "4 2"], second: Float[Array, "4 2"]) -> Homography:
     """Homography of four point pairs: exact, smooth, without linear solver.
@@ -238,7 +239,7 @@ def _distance(model: Homography, data: tuple[Array, Array, Array]) -> Float[Arra
     return jnp.sqrt(jnp.sum(transfer_error(model.homogeneous, first.T, second.T, sigma[0], valid) ** 2, axis=0))
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def estimate_homography(
     first: Float[Array, "n 2"],

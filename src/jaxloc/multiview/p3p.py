@@ -7,6 +7,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.poses import SE3, SO3
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -20,7 +21,7 @@ class MinimalPoses(eqx.Module):
     valid: Bool[Array, " k"]
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def p3p(rays: Float[Array, "3 3"], points_world: Float[Array, "3 3"]) -> MinimalPoses:
     """Camera poses from three points and their rays: up to four.

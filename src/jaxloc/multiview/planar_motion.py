@@ -2,13 +2,13 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.multiview.epipolar import depth_signs, unit_rays
 from jaxloc.multiview.p3p import MinimalPoses
 from jaxloc.poses import SE3, SO3
@@ -16,7 +16,7 @@ from jaxloc.poses import SE3, SO3
 _POLISH_STEPS = 4
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def planar_relative(first: Float[Array, "2 3"], second: Float[Array, "2 3"]) -> MinimalPoses:
     """Relative poses of a level camera that moves on a flat floor, from two correspondences: up to two.

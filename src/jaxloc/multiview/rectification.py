@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.images import Homography
 from jaxloc.multiview.epipolar import null_vector
@@ -30,7 +31,7 @@ class Rectification(eqx.Module):
     ok: Bool[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, *, shape: tuple[int, int]) -> Rectification:
     """Rectifies two calibrated cameras: epipoles at infinity, corresponding points in equal rows.
@@ -77,7 +78,7 @@ def rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, *, shape: tuple[in
     return Rectification(rig, *rotations, ok)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def rectification_map(
     camera: Pinhole, rotation: SO3, target: Pinhole, *, shape: tuple[int, int]
@@ -128,7 +129,7 @@ class RectifyingPair(eqx.Module):
     ok: Bool[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def rectifying_homographies(
     fundamental: Float[Array, "3 3"],

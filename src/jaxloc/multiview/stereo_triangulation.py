@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, gate, propagate_sampled, propagate_unscented
 from jaxloc.beliefs.square_root import cholesky
@@ -63,7 +64,7 @@ class Sampled(TriangulationMethod):
 _LINEAR = Linear()
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def triangulate(
     rig: StereoRig,
@@ -141,7 +142,7 @@ def stereo_jacobian(rig: StereoRig, measurement: Float[Array, "3"]) -> Float[Arr
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def coverage(
     rig: StereoRig,

@@ -2,12 +2,12 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.sensors import Pinhole
@@ -18,7 +18,7 @@ from jaxloc.solvers.cholesky import factor
 _UNSEEN = 1e3
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def midpoint(
     centers: Float[Array, "n 3"], rays: Float[Array, "n 3"], *, valid: Bool[Array, " n"] | None = None
@@ -56,7 +56,7 @@ def midpoint(
     return middle + factor(matrix).solve(jnp.sum(across, axis=0))
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def correct_pair(
     first: Float[Array, "2"], second: Float[Array, "2"], matrix: Float[Array, "3 3"]
@@ -147,7 +147,7 @@ class TriangulationProblem(Problem):
         return (jnp.where(visible, x, 0.0), jnp.where(visible, y, 0.0), jnp.where(visible, z, 1.0)), visible
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def triangulate(
     camera: Pinhole,

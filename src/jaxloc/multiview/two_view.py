@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc._tree import detach_unless
 from jaxloc.multiview.epipolar import (
@@ -75,7 +76,7 @@ class _Pairs(NamedTuple):
     valid: Bool[Array, " n"]
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def estimate_relative_pose(
     first: Float[Array, "n 2"],

@@ -6,13 +6,13 @@ a tilted camera are rotated to level first.
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.multiview.epipolar import depth_signs, null_vector
 from jaxloc.multiview.p3p import MinimalPoses
 from jaxloc.poses import SE3, SO3
@@ -20,7 +20,7 @@ from jaxloc.poses import SE3, SO3
 _POLISH_STEPS = 4
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def upright_p2p(rays: Float[Array, "2 3"], points_world: Float[Array, "2 3"]) -> MinimalPoses:
     """P2P with known vertical: poses of a level camera from two points and their rays, up to two.
@@ -96,7 +96,7 @@ def _about_y(cos: Float[Array, ""], sin: Float[Array, ""]) -> Float[Array, "3 3"
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def upright_relative(first: Float[Array, "3 3"], second: Float[Array, "3 3"]) -> MinimalPoses:
     """Relative poses of two level cameras from three correspondences: up to four, translations of unit length.

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import gate
 from jaxloc.beliefs.square_root import cholesky, whiten
 from jaxloc.odometry.scene_flow import MovingPoints
@@ -56,7 +57,7 @@ class MovingObjects(eqx.Module):
     valid: Bool[Array, " k"]
 
 
-@eqx.filter_jit
+@filter_jit
 def group_points(points: MovingPoints, *, options: GroupOptions = GroupOptions()) -> MovingObjects:
     """Clusters moving points: connected components of points that are close in position and velocity.
 

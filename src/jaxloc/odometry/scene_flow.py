@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, gate
 from jaxloc.beliefs.square_root import cholesky, whiten
@@ -84,7 +85,7 @@ class _Points(eqx.Module):
     valid: Bool[Array, " n"]
 
 
-@eqx.filter_jit
+@filter_jit
 def find_moving(
     rig: StereoRig,
     previous: StereoFeatures,

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.features import Descriptors, Keypoints, Matches, subpixel
 from jaxloc.features.match import match, row_gate, window_gate
 from jaxloc.poses import SE3
@@ -57,7 +58,7 @@ class StereoFeatures(eqx.Module):
     has_depth: Bool[Array, " n"]
 
 
-@eqx.filter_jit
+@filter_jit
 def match_stereo(
     left: Float[Array, "h w"],
     right: Float[Array, "h w"],
@@ -91,7 +92,7 @@ def match_stereo(
     return StereoFeatures(left, right, descriptors[0], measured, variance, has_depth)
 
 
-@eqx.filter_jit
+@filter_jit
 def match_frames(
     rig: StereoRig,
     reference: StereoFeatures,

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import gates
 from jaxloc.multiview import p3p
 from jaxloc.poses import SE3
@@ -42,7 +43,7 @@ class MotionOptions(eqx.Module):
     min_inliers: int = eqx.field(static=True, default=15)
 
 
-@eqx.filter_jit
+@filter_jit
 def estimate_motion(
     rig: StereoRig,
     matches: StereoMatches,
@@ -109,7 +110,7 @@ class _OffsetMotion(Problem):
         return seen.residual(pose)
 
 
-@eqx.filter_jit
+@filter_jit
 def estimate_disparity_offset(rig: StereoRig, matches: StereoMatches, motion: RobustEstimate) -> Estimate:
     """Estimates a constant offset of the disparities jointly with the motion (self-calibration).
 

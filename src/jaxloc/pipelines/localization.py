@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Key
 
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import Gaussian
 from jaxloc.beliefs.particles import finite_log_weights
 from jaxloc.beliefs.resampling.indices import systematic
@@ -334,7 +335,7 @@ def _update(state: State, belief: LocalizationState, before: np.ndarray, scan: S
     return belief, jax.tree.map(np.asarray, history)
 
 
-@eqx.filter_jit
+@filter_jit
 def _below_limit(ranges: Float[Array, "t b"], limit: float) -> Bool[Array, "t b"]:
     return ranges < 0.999 * limit
 

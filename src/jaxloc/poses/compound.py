@@ -8,11 +8,11 @@ References:
     Kelly, Mobile Robotics, 2013, section 2.7; used in his section 9.2 for mosaics and fiducials [K-4, K-85].
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses.se2 import SE2
 
@@ -21,7 +21,7 @@ def _rows(*rows: tuple[Array, ...]) -> Array:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def left_jacobian(a: SE2, b: SE2) -> Float[Array, "3 3"]:
     """Derivative of the compound's (x, y, theta) with respect to those of its left factor.
@@ -44,7 +44,7 @@ def left_jacobian(a: SE2, b: SE2) -> Float[Array, "3 3"]:
     return _rows((one, zero, -offset[1]), (zero, one, offset[0]), (zero, zero, one))
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def right_jacobian(a: SE2, b: SE2) -> Float[Array, "3 3"]:
     """Derivative of the compound's (x, y, theta) with respect to those of its right factor.
@@ -68,7 +68,7 @@ def right_jacobian(a: SE2, b: SE2) -> Float[Array, "3 3"]:
     return _rows((c, -s, zero), (s, c, zero), (zero, zero, one))
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def inverse_jacobian(a: SE2) -> Float[Array, "3 3"]:
     """Derivative of the inverse pose's (x, y, theta) with respect to those of the pose.

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import SE2, SE3
@@ -157,7 +158,7 @@ class Association(eqx.Module):
     total: Float[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 def pair_costs(
     pose: Gaussian, observed: Features, known: Features, *, sources: Sources = Sources(), sigma: Any = 0.05
 ) -> Costs:
@@ -205,7 +206,7 @@ def pair_costs(
     return Costs(jnp.where(feasible, values, 0.0), feasible)
 
 
-@eqx.filter_jit
+@filter_jit
 def associate(
     pose: Gaussian, observed: Features, known: Features, *, sources: Sources = Sources(), sigma: Any = 0.05
 ) -> Association:

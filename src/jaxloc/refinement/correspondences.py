@@ -27,6 +27,7 @@ import jax
 from jaxtyping import Array, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.poses import SE2, SE3
 from jaxloc.refinement.feature_pairs import (
     LineLine,
@@ -104,7 +105,7 @@ class Mixed(Problem):
         return Linearization(tuple(part.residual for part in parts), tuple(part.jacobian for part in parts))
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def refine(
     correspondences: Correspondences,

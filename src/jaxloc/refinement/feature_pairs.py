@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE2, SE3
 from jaxloc.solvers import Linearization
@@ -184,7 +185,7 @@ class LineLine(Pairs):
         return _whitened(difference, slope, self.whitening)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def nearest_on_segment(
     points: Float[Array, "n k"], first: Float[Array, "n k"], second: Float[Array, "n k"]

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import Direction
 from jaxloc.solvers import Linearization, Problem, Quadratic
@@ -169,7 +170,7 @@ class DirectionalFlow(Problem):
         return rotation, jnp.sum((measured - matmul(rotation, rows)) ** 2)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def interaction_matrix(points: Float[Array, "n 2"], depth: Float[Array, " n"]) -> Float[Array, "n 2 6"]:
     """Interaction matrix: flow of image points by the twist of the camera, ``flow_k = L_k (v, w)``.

@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import Direction
 from jaxloc.refinement.interaction_matrix import (
@@ -57,7 +58,7 @@ __all__ = [
 _DIRECTIONS = 96  # initial values on a half-sphere, 15 degrees apart
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def twist_from_flow(
     points: Float[Array, "n 2"],
@@ -102,7 +103,7 @@ def twist_from_flow(
     return _linear(FlowOfTwist(interaction, flow, whitening, loss))
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def rotation_from_flow(
     points: Float[Array, "n 2"],
@@ -140,7 +141,7 @@ def rotation_from_flow(
     return _linear(FlowOfTwist(flow_parts(points)[1], flow, whitening, loss))
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def motion_from_flow(
     points: Float[Array, "n 2"],

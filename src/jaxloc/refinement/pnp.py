@@ -2,13 +2,13 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs.square_root import product
 from jaxloc.poses import SE3
 from jaxloc.poses.lie_group import skew
@@ -17,7 +17,7 @@ from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, GaussNewton, Quadratic, Solver, Status, solve
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def refine_pose(
     camera: Pinhole,

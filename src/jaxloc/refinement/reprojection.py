@@ -5,12 +5,12 @@ Points lie along the last axis, components along the first, for speed.
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.sensors import Pinhole, StereoRig
@@ -235,7 +235,7 @@ def _lower_product(lower: Float[Array, "3 3 n"], vector: Float[Array, "3 n"]) ->
     )
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def whitener(covariances: Float[Array, "n 3 3"]) -> Float[Array, "3 3 n"]:
     """Inverse Cholesky factors of many 3x3 covariances, unrolled, points along the last axis.

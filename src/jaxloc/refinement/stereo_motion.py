@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.multiview import stereo_triangulation
 from jaxloc.poses import SE3
@@ -17,7 +18,7 @@ from jaxloc.sensors import StereoRig
 from jaxloc.solvers import Estimate, Quadratic, solve
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def refine_motion(
     rig: StereoRig,

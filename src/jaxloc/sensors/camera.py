@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.poses.lie_group import as_floats
@@ -67,7 +68,7 @@ class Pinhole(eqx.Module):
         """``K [R^T, -R^T t]``: homogeneous world points to homogeneous pixels of the camera without its lens [T-19]."""
         return matmul(self.matrix(), T_world_camera.inverse().matrix()[:3])
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def project(self, points: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
         """Pixels of points in the camera frame.
@@ -92,7 +93,7 @@ class Pinhole(eqx.Module):
             x, y = self.lens.distort(x, y)
         return self.fx * x + self.skew * y + self.cx, self.fy * y + self.cy
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def in_front(self, points: Float[Array, "n 3"]) -> Bool[Array, " n"]:
         """Whether points are projected: in front of the camera and where its lens is one-to-one."""
@@ -116,13 +117,13 @@ class Pinhole(eqx.Module):
         x = (u - self.cx - self.skew * y) / self.fx
         return (x, y) if self.lens is None else self.lens.undistort(x, y)
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def normalize(self, pixels: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
         """Undistorted normalized coordinates (x/z, y/z) of pixels [T-16]."""
         return jnp.stack(self.normalize_components(pixels[:, 0], pixels[:, 1]), axis=-1)
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def bearing(self, pixels: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
         """Unit rays "n 3" of the camera frame through pixels "n 2"."""
@@ -130,7 +131,7 @@ class Pinhole(eqx.Module):
         scale = 1.0 / jnp.sqrt(x * x + y * y + 1.0)
         return jnp.stack([x * scale, y * scale, scale], axis=-1)
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def unproject(self, pixels: Float[Array, "n 2"], depth: Float[Array, " n"]) -> Float[Array, "n 3"]:
         """Points of the camera frame at pixels.
@@ -165,7 +166,7 @@ def kelly_matrix(focal: Float[Array, ""]) -> Float[Array, "4 4"]:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def kelly_projection(points: Float[Array, "n 3"], focal: Float[Array, ""]) -> Float[Array, "n 2"]:
     """Image points ``(f x / (f + y), f z / (f + y))`` of points in a frame whose y axis is the optical axis [K-8].
@@ -188,7 +189,7 @@ def kelly_projection(points: Float[Array, "n 3"], focal: Float[Array, ""]) -> Fl
     return jnp.stack([gain * points[:, 0], gain * points[:, 2]], axis=-1)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def kelly_camera(
     T_world_camera: SE3, points_world: Float[Array, "n 3"], focal: Float[Array, ""]

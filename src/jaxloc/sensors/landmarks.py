@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _tree as tree
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Sensor
 from jaxloc.poses import SE2, SO2
@@ -146,7 +147,7 @@ def polar_jacobian(reading: RangeBearing) -> Float[Array, "2 2"]:
     return jnp.stack([ray, across])
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def confusion(
     sensor: RangeBearingSensor, poses: SE2, readings: RangeBearing, valid: Bool[Array, " t"], *, limit: float = 20.0

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 
 _FAR = 100.0  # polynomial lenses are clipped at 89.4 degrees off the axis, where their powers would overflow float32
 _WIDEST = 1.5698  # largest angle off the axis of a fisheye lens, rad: its tangent is 1000
@@ -91,7 +92,7 @@ class BrownConrady(Lens):
         cross = 2.0 * x * y
         return x * gain + p1 * cross + p2 * (r2 + 2.0 * x * x), y * gain + p1 * (r2 + 2.0 * y * y) + p2 * cross
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def undistort(
         self, xd: Float[Array, "*n"], yd: Float[Array, "*n"]
@@ -166,7 +167,7 @@ class KannalaBrandt(Lens):
         gain = jnp.where(near, on_axis, self._radius(jnp.arctan(r)) / r)
         return x * gain, y * gain
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def undistort(
         self, xd: Float[Array, "*n"], yd: Float[Array, "*n"]

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.sensors.camera import Pinhole
 
 _SMALLEST = 1e-6  # least disparity with a depth, px
@@ -44,7 +45,7 @@ class StereoRig(eqx.Module):
         self.camera = camera
         self.baseline = jnp.asarray(baseline, camera.fx.dtype)
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def project(self, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Measurements (u_left, u_right, v), px, of points "n 3" in the left camera's frame, m [T-22]."""
@@ -70,7 +71,7 @@ class StereoRig(eqx.Module):
         """`in_front` on component arrays."""
         return self.camera.in_front_components(x, y, z)
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def triangulate(self, measurements: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Points of the left camera's frame, the exact inverse of `project`.

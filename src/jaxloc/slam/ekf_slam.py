@@ -20,6 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, Motion, gate, validity
 from jaxloc.beliefs.models import innovation, mask_covariance
@@ -148,7 +149,7 @@ class EkfSlam(Filter):
         landmarks = jnp.zeros((self.capacity, 2), dtype)
         return SlamState(pose, landmarks, covariance, none, none.astype(jnp.int32), jnp.zeros((), jnp.int32))
 
-    @eqx.filter_jit
+    @filter_jit
     def predict(self, state: SlamState, control: Any, *, key: Key[Array, ""] | None = None) -> SlamState:
         """Predicts the pose; landmarks stay where they are.
 
@@ -171,7 +172,7 @@ class EkfSlam(Filter):
         moved = SlamState(pose, state.landmarks, covariance, state.seen, state.support, state.step + 1)
         return _is_usable(moved), moved
 
-    @eqx.filter_jit
+    @filter_jit
     def update(
         self, state: SlamState, measurement: RangeBearing, valid: Bool[Array, ""], *, key: Key[Array, ""] | None = None
     ) -> tuple[SlamState, SlamInfo]:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _linalg
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import validity
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Problem, Quadratic, solve
@@ -125,7 +126,7 @@ class PoseGraph(Problem):
         return Linearization(residual, jacobian[1:].reshape(count * dof, dof, -1))
 
 
-@eqx.filter_jit
+@filter_jit
 def optimize(
     poses: Any, edges: Edges, *, loss: Any = Quadratic(), solver: Solver = LevenbergMarquardt(), max_steps: int = 50
 ) -> Estimate:

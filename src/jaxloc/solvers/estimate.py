@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _linalg
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import tangent_labels
 from jaxloc.solvers.cholesky import rank_tolerance
@@ -77,7 +78,7 @@ class Estimate(eqx.Module):
         """The estimate as a density, as filters, trackers and pose graphs take it."""
         return Gaussian(self.value, self.covariance)
 
-    @eqx.filter_jit
+    @filter_jit
     def observability(self) -> Observability:
         """Spectrum and rank of the information matrix [K-13]."""
         diagonal = jnp.diagonal(self.information)

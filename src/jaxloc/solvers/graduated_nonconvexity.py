@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxloc._jit import filter_jit
 from jaxloc.solvers.estimate import Estimate
 from jaxloc.solvers.gauss_newton import GaussNewton, Solver
 from jaxloc.solvers.least_squares import minimize, solve
@@ -13,7 +14,7 @@ from jaxloc.solvers.problem import Problem
 from jaxloc.solvers.robust_kernels import Loss
 
 
-@eqx.filter_jit
+@filter_jit
 def solve_graduated(
     problem: Problem,
     initial: Any,

@@ -10,6 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import tangent_dimension
 from jaxloc.solvers.cholesky import factor
@@ -27,7 +28,7 @@ from jaxloc.solvers.problem import (
 )
 
 
-@eqx.filter_jit
+@filter_jit
 def solve(problem: Problem, initial: Any, *, solver: Solver = GaussNewton(), max_steps: int = 50) -> Estimate:
     """Minimizes the robust sum of squares ``sum rho(|r_i|^2)`` of a problem's whitened residuals.
 

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc import _linalg
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE2, SE3, SO2, SO3
 from jaxloc.solvers.cholesky import rank_tolerance
@@ -64,7 +65,7 @@ class PointAlignment(Problem):
         return ((state.apply(self.source) - self.target) * self.whitening[:, None]).T
 
 
-@eqx.filter_jit
+@filter_jit
 def align_points(
     source: Float[Array, "n k"],
     target: Float[Array, "n k"],
@@ -105,7 +106,7 @@ def align_points(
     return _estimate(problem, value, determined)
 
 
-@eqx.filter_jit
+@filter_jit
 def align_scaled_points(
     source: Float[Array, "n k"],
     target: Float[Array, "n k"],

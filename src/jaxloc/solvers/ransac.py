@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import Gaussian
 from jaxloc.solvers.estimate import Estimate
 
@@ -107,7 +108,7 @@ class RobustEstimate(eqx.Module):
         return self
 
 
-@eqx.filter_jit
+@filter_jit
 def ransac(
     data: Any,
     fit: Callable[[Any], Any],

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc.alignment.correlation.peaks import find_peaks
 from jaxloc.alignment.correlation.scores import Score, ZeroMeanCorrelation
 from jaxloc.alignment.correlation.search import score_map
@@ -29,7 +30,7 @@ class Classification(eqx.Module):
     ok: Bool[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 def classify(
     image: Num[Array, "h w"] | Any, templates: Num[Array, "k m n"] | Any, *, score: Score = ZeroMeanCorrelation()
 ) -> Classification:

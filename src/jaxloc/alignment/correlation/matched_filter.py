@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.normalization import as_gray
 
 
@@ -62,7 +63,7 @@ class ColoredNoise(Noise):
         return self.spectrum.astype(dtype)
 
 
-@eqx.filter_jit
+@filter_jit
 def respond(image: Num[Array, "h w"] | Any, pattern: Num[Array, "m n"] | Any, *, noise: Noise) -> Response:
     """Filters an image for the greatest signal-to-noise ratio at a pattern.
 

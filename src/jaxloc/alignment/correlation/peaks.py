@@ -6,6 +6,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
+
 
 class Peaks(eqx.Module):
     """The highest local maxima of a surface, the highest first.
@@ -102,7 +104,7 @@ def fit_parabola_at(surface: Float[Array, "p q"], row: Int[Array, ""], column: I
     return Parabola(offset, jnp.where(inside, fit.height, center), fit.hessian, fit.sharp & inside)
 
 
-@eqx.filter_jit
+@filter_jit
 def find_peaks(surface: Float[Array, "p q"], *, count: int = 4, separation: int = 3) -> Peaks:
     """Highest local maxima with a least distance from each other (non-maximum suppression).
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc.alignment.correlation.peaks import find_peaks, fit_parabola_at
 from jaxloc.alignment.correlation.scores import (
     Correlator,
@@ -167,13 +168,13 @@ def _filled(image: Array, known: Array) -> Array:
     return jnp.where(known, image, jnp.sum(jnp.where(known, image, 0.0)) / count)
 
 
-@eqx.filter_jit
+@filter_jit
 def _score_map(pair: Pair, finite: Bool[Array, "h w"], score: Score) -> Float[Array, "p q"]:
     surface = score.surface(pair)
     return jnp.where(unknown_places(finite, pair.template.shape), score.worst(pair), surface)
 
 
-@eqx.filter_jit
+@filter_jit
 def _search(pair: Pair, finite: Array, window: Window | None, score: Score, sigma: Any, max_ratio: float) -> Estimate:
     corner, known = jnp.zeros(2, pair.image.dtype), jnp.asarray(True)
     if window is not None:

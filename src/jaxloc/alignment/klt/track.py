@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, UInt8
 
+from jaxloc._jit import filter_jit
 from jaxloc.alignment.klt.covariance import conclude
 from jaxloc.alignment.klt.frames import Frame, build_frame, relative_gain
 from jaxloc.alignment.klt.records import Klt, Tracked
@@ -12,7 +13,7 @@ from jaxloc.alignment.klt.search import search
 from jaxloc.images.interpolation import inside_image
 
 
-@eqx.filter_jit
+@filter_jit
 def prepare(image: Float[Array, "h w"] | UInt8[Array, "h w"], *, options: Klt = Klt()) -> Frame:  # noqa: B008
     """Preprocesses an image for tracking, so that each frame of a video is prepared once.
 
@@ -39,7 +40,7 @@ def prepare(image: Float[Array, "h w"] | UInt8[Array, "h w"], *, options: Klt = 
     return build_frame(image, levels, options.size // 2 + 2)
 
 
-@eqx.filter_jit
+@filter_jit
 def track(
     previous: Float[Array, "h w"] | UInt8[Array, "h w"],
     current: Float[Array, "h2 w2"] | UInt8[Array, "h2 w2"],
@@ -88,7 +89,7 @@ def track(
     return track_frames(*frames, points, initial=initial, valid=valid, options=options)
 
 
-@eqx.filter_jit
+@filter_jit
 def track_frames(
     previous: Frame,
     current: Frame,
@@ -136,7 +137,7 @@ def _check_backward(previous: Frame, current: Frame, source, found: Tracked, gai
     return eqx.tree_at(lambda tracked: (tracked.ok, tracked.forward_backward), found, (ok, missed))
 
 
-@eqx.filter_jit
+@filter_jit
 def track_sequence(
     images: Float[Array, "t h w"] | UInt8[Array, "t h w"],
     points: Float[Array, "n 2"],

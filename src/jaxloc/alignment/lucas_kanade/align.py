@@ -2,12 +2,12 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc.alignment.lucas_kanade.covariance import AlignmentData, AlignmentEquations, conclude
 from jaxloc.alignment.lucas_kanade.iteration import Limits, SearchResult, descend
 from jaxloc.alignment.lucas_kanade.normal_equations import zero_brightness
@@ -96,7 +96,7 @@ def initial_warp(warp: type[Warp], initial: Warp | None, template: Any) -> Warp:
     return jax.tree.map(lambda leaf: leaf.astype(dtype), first)
 
 
-@eqx.filter_jit
+@filter_jit
 def _align(
     image: Any, template: Any, weights: Any, sigma: Any, warp: type[Warp], initial: Any, method: Any
 ) -> Estimate:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxloc import _linalg
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.alignment.lucas_kanade.pyramid_level import Frame
 from jaxloc.alignment.mutual_information.density import Binning, joint_density, log_ratio, pixel_weights
@@ -241,7 +242,7 @@ def _climb(scale: _Scale, warp: Warp, method: MutualInformation) -> _Ascent:
     return lax.while_loop(go_on, advance, first)
 
 
-@eqx.filter_jit
+@filter_jit
 def _align(image: Array, template: Array, weight: Array, initial: Warp, method: MutualInformation) -> Estimate:
     finite = jnp.all(jnp.isfinite(initial.matrix()))
     safe = tree.where(finite, initial, type(initial).identity(image.dtype))

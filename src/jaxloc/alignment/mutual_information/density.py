@@ -11,13 +11,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.images.normalization import as_gray
 
 _LEAST_BINS = 5
 
 
-@eqx.filter_jit
+@filter_jit
 def mutual_information(
     a: Num[Array, "h w"] | Any,
     b: Num[Array, "h w"] | Any,

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.cli import results
 from jaxloc.data import StereoSequence
 from jaxloc.evaluation import consistency, plots, report, trajectories
@@ -167,7 +167,7 @@ class _Numbers:
         self.timings = {name: float(value) for name, value in output.timings.items()}
 
 
-@eqx.filter_jit
+@filter_jit
 def _compare(
     estimate: Trajectory,
     truth: Trajectory,

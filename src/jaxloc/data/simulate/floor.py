@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Float64, UInt8
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.interpolation import Bicubic, sample_components
 from jaxloc.poses.planar import compose_poses, relative_poses
 from jaxloc.sensors import BrownConrady, Pinhole
@@ -194,7 +195,7 @@ class Photographer:
         return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-@eqx.filter_jit
+@filter_jit
 def _look(
     texture: Float[Array, "rows columns"],
     start: Float[Array, "2"],

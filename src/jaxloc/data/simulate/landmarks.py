@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import Motion
 from jaxloc.poses import SE2, retract
 from jaxloc.sensors import Increment, RangeBearing
@@ -31,7 +32,7 @@ class LandmarkDrive(eqx.Module):
     landmarks: Float[Array, "k 2"]
 
 
-@eqx.filter_jit
+@filter_jit
 def simulate_landmarks(
     motion: Motion,
     deviations: Float[Array, "2"],

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from jaxloc._jit import filter_jit
 from jaxloc.poses import SE3, Trajectory, chain
 from jaxloc.sensors import Pinhole, StereoRig
 
@@ -57,7 +58,7 @@ def kitti_rig() -> StereoRig:
     return StereoRig(Pinhole(718.856, 718.856, 607.1928, 185.2157), 386.1448 / 718.856)
 
 
-@eqx.filter_jit
+@filter_jit
 def simulate_drive(num_frames: int, *, key: Key[Array, ""], speed: float = 10.0) -> Trajectory:
     """Simulates the path of a camera on a car: about a meter a frame, in bends, with a little pitch, roll and heave.
 
@@ -87,7 +88,7 @@ def simulate_drive(num_frames: int, *, key: Key[Array, ""], speed: float = 10.0)
     return Trajectory(times, chain(SE3.identity(dtype), jax.vmap(SE3.exp)(twists)))
 
 
-@eqx.filter_jit
+@filter_jit
 def simulate_pair(
     motion: SE3,
     rig: StereoRig,
@@ -143,7 +144,7 @@ def _draw_measurements(key: Key[Array, ""], rig: StereoRig, count: int, size: tu
     return jnp.stack([u, u - rig.camera.fx * rig.baseline * inverse_depth, v], axis=1)
 
 
-@eqx.filter_jit
+@filter_jit
 def simulate_stereo_points(
     *,
     key: Key[Array, ""],

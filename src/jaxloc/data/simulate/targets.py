@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Motion, Sensor
 from jaxloc.beliefs.square_root import cholesky
@@ -310,7 +311,7 @@ class TargetDrive(eqx.Module):
     sources: Int[Array, "t m"]
 
 
-@eqx.filter_jit
+@filter_jit
 def simulate_targets(scenario: TargetScenario, *, key: Key[Array, ""]) -> TargetDrive:
     """Simulates targets with noisy measurements, missed detections and uniform clutter.
 

@@ -19,6 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.solvers import assign
 
 
@@ -107,7 +108,7 @@ def ospa(
     return _ospa(x, valid_x, y, valid_y, jnp.asarray(cutoff, x.dtype), _at_least_one(order))
 
 
-@eqx.filter_jit
+@filter_jit
 def _ospa(x: Array, valid_x: Array, y: Array, valid_y: Array, cutoff: Array, order: float) -> Ospa:
     cutoff, ok = _usable_cutoff(cutoff, order)
     match = _match(_distances(x, y, cutoff, order), valid_x, valid_y, cutoff**order)
@@ -155,7 +156,7 @@ def gospa(
     return _gospa(x, valid_x, y, valid_y, *limits, _at_least_one(order))
 
 
-@eqx.filter_jit
+@filter_jit
 def _gospa(x: Array, valid_x: Array, y: Array, valid_y: Array, cutoff: Array, alpha: Array, order: float) -> Gospa:
     cutoff, ok = _usable_cutoff(cutoff, order)
     bounded = (alpha >= 1e-6) & (alpha <= 2.0)
@@ -218,7 +219,7 @@ def ospa2(
     return _ospa2(x, valid_x, y, valid_y, jnp.asarray(cutoff, x.dtype), window, _at_least_one(order))
 
 
-@eqx.filter_jit
+@filter_jit
 def _ospa2(x: Array, valid_x: Array, y: Array, valid_y: Array, cutoff: Array, window: int, order: float) -> Ospa:
     cutoff, ok = _usable_cutoff(cutoff, order)
     limit = cutoff**order

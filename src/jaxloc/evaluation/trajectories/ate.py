@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.evaluation.trajectories.alignment import Alignment, RigidAlignment
 from jaxloc.evaluation.trajectories.paths import check_lengths, safe_sqrt
 from jaxloc.poses import Trajectory
@@ -44,7 +45,7 @@ class Errors(eqx.Module):
         return jnp.where(self.count() > 0, middle, 0.0)
 
 
-@eqx.filter_jit
+@filter_jit
 def ate(
     estimate: Trajectory,
     truth: Trajectory,

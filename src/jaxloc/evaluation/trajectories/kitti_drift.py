@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.evaluation.trajectories.paths import check_lengths, path_distances, rotation_angle
 from jaxloc.evaluation.trajectories.rpe import motion_differences
 from jaxloc.poses import Trajectory
@@ -52,7 +53,7 @@ def _mean(values: Float[Array, "*s"], valid: Bool[Array, "*s"]) -> Float[Array, 
     return jnp.sum(values) / jnp.maximum(jnp.sum(valid), 1).astype(values.dtype)
 
 
-@eqx.filter_jit
+@filter_jit
 def segment_errors(
     estimate: Trajectory,
     truth: Trajectory,
@@ -125,7 +126,7 @@ def fitting_lengths(length: float) -> tuple[float, ...]:
     return tuple(length * part / 16.0 for part in range(1, 9)) if length > 0 else ()
 
 
-@eqx.filter_jit
+@filter_jit
 def end_drift_percent(estimate: Trajectory, truth: Trajectory) -> Float[Array, ""]:
     """Position error at the end of the path, in % of the distance traveled, both paths starting from the same pose.
 
@@ -149,7 +150,7 @@ def end_drift_percent(estimate: Trajectory, truth: Trajectory) -> Float[Array, "
     return curve[-1] if len(truth) else jnp.zeros((), curve.dtype)
 
 
-@eqx.filter_jit
+@filter_jit
 def drift_curve_percent(estimate: Trajectory, truth: Trajectory) -> Float[Array, " n"]:
     """:func:`end_drift_percent` of the path up to each pose.
 

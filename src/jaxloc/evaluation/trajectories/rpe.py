@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.evaluation.trajectories.ate import Errors
 from jaxloc.evaluation.trajectories.paths import check_lengths, path_distances, rotation_angle, safe_sqrt, step_lengths
 from jaxloc.poses import Trajectory
@@ -108,7 +109,7 @@ class Meters(Spacing):
         return Pairs(first, second, jnp.minimum(gap_above, gap_below) <= self.tolerance * self.delta)
 
 
-@eqx.filter_jit
+@filter_jit
 def rpe(
     estimate: Trajectory,
     truth: Trajectory,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.integral import filter_boxes
 
 # Blur of the Gaussian that the smallest filter, nine pixels wide, stands for.
@@ -56,7 +57,7 @@ def filter_scale(size: Float[Array, " n"]) -> Float[Array, " n"]:
     return size * (_SIGMA / _SMALLEST)
 
 
-@eqx.filter_jit
+@filter_jit
 def box_hessian(image: Float[Array, "h w"], *, octave: int = 0, weight: float = 0.9) -> BoxHessian:
     """Second derivatives of a Gaussian by boxes: ``det = D_uu D_vv - (w D_uv)^2``, every filter divided by its area.
 

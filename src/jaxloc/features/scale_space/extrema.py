@@ -5,6 +5,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
+
 _MOVES = 5
 
 
@@ -41,7 +43,7 @@ class ExtremumTest(eqx.Module):
     within_layer: bool = eqx.field(static=True, default=False)
 
 
-@eqx.filter_jit
+@filter_jit
 def find_extrema(stack: Float[Array, "s h w"], test: ExtremumTest, *, capacity: int) -> Extrema:
     """Extrema among 26 neighbors, refined by a quadratic model, without low contrast and edges.
 

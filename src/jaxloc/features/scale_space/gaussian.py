@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.gradients import smooth
 
 
@@ -54,7 +55,7 @@ class ScaleSpace(eqx.Module):
         return tuple(self.sigma * self.ratio**k for k in range(self.octave_layers + 3))
 
 
-@eqx.filter_jit
+@filter_jit
 def laplacian(image: Float[Array, "h w"], sigma: float) -> Float[Array, "h w"]:
     """Scale-normalized Laplacian of Gaussian, ``sigma^2 (d_uu + d_vv) G_sigma * I``.
 
@@ -97,7 +98,7 @@ def laplacian(image: Float[Array, "h w"], sigma: float) -> Float[Array, "h w"]:
     return convolve(second, gauss) + convolve(gauss, second)
 
 
-@eqx.filter_jit
+@filter_jit
 def difference_of_gaussians(image: Float[Array, "h w"], sigma: float, ratio: float) -> Float[Array, "h w"]:
     """``(G_(k sigma) - G_sigma) * I``, which is ``(k - 1)`` times the scale-normalized Laplacian, to first order.
 
@@ -134,7 +135,7 @@ def double(image: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
     return along(along(image).T).T
 
 
-@eqx.filter_jit
+@filter_jit
 def octaves(image: Float[Array, "h w"], options: ScaleSpace) -> tuple[Octave, ...]:
     """The octaves of an image, finest first.
 

@@ -9,6 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.diffusion import (
     Conductivity,
     PeronaMalik,
@@ -133,7 +134,7 @@ class Stack(eqx.Module):
     step: float = eqx.field(static=True)
 
 
-@eqx.filter_jit
+@filter_jit
 def nonlinear_scale_space(image: Float[Array, "h w"], options: NonlinearScaleSpace) -> tuple[Stack, ...]:
     """The nonlinear scale space of an image, finest stack first.
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 
 _BATCH = 64
@@ -24,7 +25,7 @@ class DominantDirection(eqx.Module):
     ok: Bool[Array, " n"]
 
 
-@eqx.filter_jit
+@filter_jit
 def dominant_direction(
     right: Float[Array, "n k"], down: Float[Array, "n k"], *, width: float = math.pi / 3.0
 ) -> DominantDirection:

@@ -2,13 +2,13 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs.models import innovation
 from jaxloc.beliefs.square_root import cholesky, product, triangularize, whiten
 from jaxloc.filters.extended import ExtendedKalmanFilter
@@ -19,7 +19,7 @@ from jaxloc.filters.smoothers import regression, reverse_step
 from jaxloc.poses import carry, is_flat, local, retract
 
 
-@eqx.filter_jit
+@filter_jit
 def run_parallel(
     filt: KalmanFilter | ExtendedKalmanFilter,
     state: GaussianState,
@@ -90,7 +90,7 @@ def run_parallel(
     return jax.tree.map(lambda leaf: leaf[-1], states), History(states, infos)
 
 
-@eqx.filter_jit
+@filter_jit
 def smooth_parallel(
     filt: GaussianFilter,
     history: History,

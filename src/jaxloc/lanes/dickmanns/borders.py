@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian
 from jaxloc.lanes.dickmanns.edges import EdgeDetector, LightStripe, find_edge
@@ -49,7 +50,7 @@ class Borders(eqx.Module):
     visible: Bool[Array, " n"]
 
 
-@eqx.filter_jit
+@filter_jit
 def measure(
     image: Num[Array, "h w"],
     ground: GroundCamera,

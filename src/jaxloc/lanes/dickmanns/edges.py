@@ -6,6 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
+
 
 class EdgeDetector(eqx.Module):
     """Edge detector (strategy): a kernel correlated with the profile, whose greatest response is the border."""
@@ -83,7 +85,7 @@ class Edge(eqx.Module):
     ok: Bool[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 def find_edge(
     profile: Float[Array, " columns"],
     variance: Float[Array, ""],

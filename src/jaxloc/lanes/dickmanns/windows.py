@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.interpolation import Bilinear, sample_components
 from jaxloc.images.normalization import as_gray
 from jaxloc.lanes.dickmanns.model import RoadState
@@ -72,7 +73,7 @@ class ColumnSums(eqx.Module):
     seen: Bool[Array, " n"]
 
 
-@eqx.filter_jit
+@filter_jit
 def sum_columns(
     image: Num[Array, "h w"] | Any, ground: GroundCamera, state: RoadState, windows: Windows | None = None
 ) -> ColumnSums:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.lanes.ground_view import GroundView
 from jaxloc.lanes.lane import Lane
 from jaxloc.lanes.ralph.match import Match, match_profile
@@ -77,7 +78,7 @@ class LaneThresholds(eqx.Module):
     move: float = 0.8
 
 
-@eqx.filter_jit
+@filter_jit
 def estimate(
     view: GroundView,
     template: Template,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.lanes.ralph.profile import Profile
 from jaxloc.lanes.ralph.template import Template
 
@@ -39,7 +40,7 @@ class Match(eqx.Module):
         return peak - jnp.clip(self.sidelobe, 0.0, peak)
 
 
-@eqx.filter_jit
+@filter_jit
 def match_profile(profile: Profile, bank: Template, *, reach: Any = 1.5, around: Any = 0.0) -> Match:
     """Slides a profile along templates [K-39], [K-41].
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.interpolation import Bicubic
 from jaxloc.lanes.ground_view import GroundView
 from jaxloc.lanes.lane import Lane
@@ -167,7 +168,7 @@ def _steps(profile: Profile) -> Float[Array, " c"]:
     return jnp.where(both, profile.values[1:] - profile.values[:-1], 0.0)
 
 
-@eqx.filter_jit
+@filter_jit
 def straightness(view: GroundView, fit: LaneFit, *, sharpness: Sharpness = AbsoluteSteps()) -> Float[Array, ""]:
     """Straightness of the road under one hypothesis; for many, use ``jax.vmap`` [K-36], [K-37].
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.lanes.ground_view import GroundView
 from jaxloc.lanes.ralph.profile import AbsoluteSteps, LaneFit, Profile, Sharpness, straighten
 
@@ -77,7 +78,7 @@ class Straightest(eqx.Module):
     scores: Float[Array, "p h c"]
 
 
-@eqx.filter_jit
+@filter_jit
 def find_straightest(
     view: GroundView, hypotheses: Hypotheses, *, sharpness: Sharpness = AbsoluteSteps()
 ) -> Straightest:

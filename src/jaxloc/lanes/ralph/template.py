@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc.lanes.ground_view import GroundView, halve_columns
 from jaxloc.lanes.ralph.profile import LaneFit, straighten
 from jaxloc.poses.lie_group import as_floats
@@ -34,7 +35,7 @@ class Template(eqx.Module):
         return Template(values, known, jnp.mean(left, axis=1))
 
 
-@eqx.filter_jit
+@filter_jit
 def capture(
     view: GroundView, fit: LaneFit, *, near: Any = 0.0, far: Any = 1e6, left: Float[Array, " columns"] | None = None
 ) -> Template:
@@ -76,7 +77,7 @@ def _standard(template: Template) -> Template:
     return Template(centered * gain, template.known, template.left)
 
 
-@eqx.filter_jit
+@filter_jit
 def blend(template: Template, fresh: Template, rate: Float[Array, ""]) -> Template:
     """Exponential blend of a template with the current profile, ``(1 - rate) T + rate F`` [K-43].
 

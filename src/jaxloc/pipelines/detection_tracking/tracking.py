@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float64
 
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import Mixture
 from jaxloc.filters import ConstantVelocity, History, KalmanFilter
 from jaxloc.filters import run as run_filter
@@ -238,7 +239,7 @@ def _pad(state: State, frames: list[Frame], used: list[np.ndarray], length: int)
     return Control(jnp.asarray(dt, jnp.float32), poses), measured, jnp.asarray(valid), active
 
 
-@eqx.filter_jit
+@filter_jit
 def _scan(
     tracker: MovingCameraTracker,
     scene: Any,

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import Gaussian, Sensor
 from jaxloc.filters import ExtendedKalmanFilter
 from jaxloc.filters.interface import GaussianState
@@ -108,7 +109,7 @@ def detect_lane(tracker: LaneTracker, image: Float[Array, "h w"], bank: ralph.Te
     return eqx.tree_at(lambda m: (m.ok, m.confidence), update, (ok, jnp.where(ok, update.confidence, 0.0)))
 
 
-@eqx.filter_jit
+@filter_jit
 def _run_ralph(
     tracker: LaneTracker, image: Float[Array, "h w"], bank: ralph.Template, tried: ralph.Hypotheses
 ) -> ralph.LaneState:
@@ -117,7 +118,7 @@ def _run_ralph(
     return ralph.estimate(view, bank, hypotheses=tried, pitch_sigma=tracker.pitch_sigma)
 
 
-@eqx.filter_jit
+@filter_jit
 def _propose(tracker: LaneTracker, image: Float[Array, "h w"], bank: ralph.Template) -> GaussianState:
     """RALPH's search without its refinement, as a wide prior.
 
@@ -133,7 +134,7 @@ def _propose(tracker: LaneTracker, image: Float[Array, "h w"], bank: ralph.Templ
     return _prior_state(tracker, RoadState(lane, tracker.width * share, rough.pitch), jnp.ones_like(tracker.width))
 
 
-@eqx.filter_jit
+@filter_jit
 def _as_prior(tracker: LaneTracker, seen: ralph.LaneState) -> GaussianState:
     """A fit of RALPH as a narrow prior."""
     fit = jax.tree.map(lambda leaf: jnp.where(seen.ok, leaf, 0.0), seen.estimate.value)
@@ -145,7 +146,7 @@ def _straight_lane(tracker: LaneTracker) -> ralph.LaneFit:
     return ralph.LaneFit(zero, zero, zero, zero)
 
 
-@eqx.filter_jit
+@filter_jit
 def update_by_borders(tracker: LaneTracker, predicted: GaussianState, image: Float[Array, "h w"]) -> Update:
     """Updates a prediction by the borders measured in their windows; not ok where there are too few edges.
 
@@ -185,7 +186,7 @@ def update_by_template(
     return _update_by_fit(tracker, predicted, _run_ralph(tracker, image, _repeated(template), tried))
 
 
-@eqx.filter_jit
+@filter_jit
 def _update_by_fit(tracker: LaneTracker, predicted: GaussianState, seen: ralph.LaneState) -> Update:
     fit = seen.estimate.value
     values = jnp.stack([fit.offset, fit.heading, fit.curvature, fit.pitch])
@@ -217,13 +218,13 @@ def _repeated(template: ralph.Template) -> ralph.Template:
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(_WIDTHS), *leaf.shape)), template)
 
 
-@eqx.filter_jit
+@filter_jit
 def predict(tracker: LaneTracker, state: GaussianState, ride: Ride) -> GaussianState:
     """The state predicted at the next image."""
     return _filter(tracker).predict(state, ride)
 
 
-@eqx.filter_jit
+@filter_jit
 def adapt_template(
     tracker: LaneTracker, image: Float[Array, "h w"], state: RoadState, template: ralph.Template, rate: Float[Array, ""]
 ) -> ralph.Template:
@@ -234,7 +235,7 @@ def adapt_template(
     return ralph.blend(template, ralph.capture(view, fit, left=template.left), rate)
 
 
-@eqx.filter_jit
+@filter_jit
 def border_columns(tracker: LaneTracker, state: RoadState, rows: Float[Array, " r"]) -> Float[Array, "2 r"]:
     """Columns of the left and the right border in rows of the image."""
     camera = state.camera(tracker.ground)
@@ -266,7 +267,7 @@ def initial_state(tracker: LaneTracker) -> GaussianState:
     )
 
 
-@eqx.filter_jit
+@filter_jit
 def _prior_state(tracker: LaneTracker, mean: RoadState, scale: Float[Array, ""]) -> GaussianState:
     sigmas = jnp.array([0.4, 0.01, 5e-4, 8e-6, 0.0, 0.0], tracker.width.dtype)
     sigmas = sigmas.at[4].set(tracker.width_sigma).at[5].set(tracker.pitch_sigma)

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian
 from jaxloc.filters import ConstantVelocity, KalmanFilter
@@ -67,7 +67,7 @@ def build_tracker(
     return GmPhd(model, capacity=config.capacity, closeness=config.merge, gate=0.999, extraction=config.keep_weight)
 
 
-@eqx.filter_jit
+@filter_jit
 def update_filter(
     state: PhdState,
     rig: StereoRig,

@@ -2,13 +2,13 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _tree as tree
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.poses import SE3
 from jaxloc.refinement.bundle.estimate import BundleEstimate
 from jaxloc.refinement.bundle.gradient import BundleEquations
@@ -110,7 +110,7 @@ class _Setup(NamedTuple):
     solver: LevenbergMarquardt
 
 
-@eqx.filter_jit
+@filter_jit
 def _adjust(setup: _Setup, initial: Bundle, structure: Structure, max_steps: int) -> BundleEstimate:
     problem = BundleProblem.of(setup.model, initial, setup.observations, setup.gauge, setup.loss)
     detached = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf), (problem, initial))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian
 from jaxloc.poses import SE3
@@ -46,7 +47,7 @@ class BundleEstimate(eqx.Module):
     problem: BundleProblem
     structure: Structure
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def pose_covariance(self, cameras: Int[Array, " q"]) -> Float[Array, "q 6 q 6"]:
         """Joint covariance of chosen poses in their tangents (right perturbation); zero for fixed ones.
@@ -70,7 +71,7 @@ class BundleEstimate(eqx.Module):
         free = ~self.problem.gauge.fixed[cameras]
         return jnp.where((free[:, None] & free[None, :])[:, None, :, None], _finite(blocks), 0.0)
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def point_covariance(self, points: Int[Array, " q"]) -> Float[Array, "q 3 3"]:
         """Covariance of each of chosen points, world frame, m^2.
@@ -117,7 +118,7 @@ class BundleEstimate(eqx.Module):
         """
         return self._pose_estimate(jnp.asarray(camera, jnp.int32))
 
-    @eqx.filter_jit
+    @filter_jit
     def _pose_estimate(self, index: Int[Array, ""]) -> Estimate:
         pose: SE3 = jax.tree.map(lambda leaf: leaf[index], self.value.poses)
         covariance = self.pose_covariance(index[None])[0, :, 0, :]

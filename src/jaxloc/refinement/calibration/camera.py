@@ -9,6 +9,7 @@ from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration.model import Intrinsics, Parametrization
@@ -34,7 +35,7 @@ class Calibrated(eqx.Module):
     T_camera_board: SE3
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def calibrate(
     board: Float[Array, "corners 3"],

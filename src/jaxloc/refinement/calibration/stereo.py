@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc import _linalg
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3
 from jaxloc.refinement.calibration.camera import check_corners, fit, prepare, transform_estimate
@@ -47,7 +48,7 @@ class CalibratedStereo(eqx.Module):
     T_left_board: SE3
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def calibrate_stereo(
     board: Float[Array, "corners 3"],

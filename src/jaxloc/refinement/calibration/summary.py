@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration.problem import project
 from jaxloc.refinement.calibration.zhang import finite_views
@@ -84,7 +85,7 @@ def camera_parameters(estimate: Estimate, which: int = 0) -> Parameters:
     return Parameters(names[which], values, estimate.covariance[chosen, chosen])
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def board_errors(
     camera: Pinhole,

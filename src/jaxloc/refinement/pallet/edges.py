@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.images.gradients import central_difference, smooth
 from jaxloc.images.interpolation import sample
 from jaxloc.images.normalization import as_gray
@@ -88,7 +89,7 @@ class MeasuredEdges(eqx.Module):
     sigma: Float[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 def level_view(image: Any, camera: GroundCamera) -> LevelView:
     """Rectifies an image to a level camera without lens distortion.
 

@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Num
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.poses import SE2
 from jaxloc.refinement.pallet.edges import (
     LevelView,
@@ -78,7 +79,7 @@ class _Proposal(eqx.Module):
     correlation: Float[Array, ""]
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def find_pallet(
     image: Num[Array, "h w"],
@@ -116,7 +117,7 @@ def find_pallet(
     return detect_pallet(image, camera, types, search=search).estimate
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def detect_pallet(
     image: Num[Array, "h w"],

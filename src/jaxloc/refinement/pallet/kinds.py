@@ -1,11 +1,11 @@
 """Classification of pallets by correlation with rendered templates of the fronts [K-75]."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.images.interpolation import sample
 from jaxloc.images.normalization import standardize
 from jaxloc.poses import SE2
@@ -16,7 +16,7 @@ _ROWS, _COLUMNS = 24, 128
 _MARGIN = 1.08  # width of the template over that of the face, to include the background beside it
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def face_template(kind: PalletType) -> Float[Array, "24 128"]:
     """Template of the front of a pallet: one for wood, zero in the holes and beside the face.
@@ -34,7 +34,7 @@ def face_template(kind: PalletType) -> Float[Array, "24 128"]:
     return jnp.where(wood, 1.0, 0.0).astype(kind.hole_width.dtype)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def view_face(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, "24 128"]:
     """The image at the face of a pallet with a given pose, sampled along the face.
@@ -59,7 +59,7 @@ def view_face(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, "24 
     return jnp.where(visible, read.values.reshape(u.shape), jnp.nan)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def type_correlation(view: LevelView, kind: PalletType, pose: SE2) -> Float[Array, ""]:
     """Normalized correlation of the image at a pose with the template of a kind.
@@ -84,7 +84,7 @@ def type_correlation(view: LevelView, kind: PalletType, pose: SE2) -> Float[Arra
     return jnp.where(jnp.mean(visible.astype(face.dtype)) > 0.8, jnp.sum(a * b) / count, 0.0)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def correlate_types(view: LevelView, kinds: PalletType, pose: SE2) -> Float[Array, " m"]:
     """`type_correlation` with each kind of a bank at one pose.

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE2
 from jaxloc.poses.lie_group import as_floats
@@ -121,7 +122,7 @@ def cross_ratio(bearings: Float[Array, "4"]) -> Float[Array, ""]:
     return jnp.where(some, (a - c) * (b - d) / jnp.where(some, below, 1.0), 0.0)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def edge_bearings(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[Array, " n"]:
     """Bearings of vertical edges of a pallet in the image: ``y_i = f y / x`` px left of the principal column [K-76].
@@ -144,7 +145,7 @@ def edge_bearings(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[Arr
     return jnp.where(in_front, focal * y / x, 0.0)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def printed_jacobian(pose: SE2, edges: Float[Array, " n"], focal: Any) -> Float[Array, "3 n"]:
     """Derivative of the bearings by the pallet's (x, y, heading) as printed in the lecture, edges last.
@@ -211,7 +212,7 @@ class PalletEdges(Problem):
         return jnp.all(in_front | (self.whitening <= 0)) & (normal > 0)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def pose_from_edges(
     kind: PalletType,

@@ -8,6 +8,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc.poses import SE2
 from jaxloc.sensors.maps.occupancy_map import OccupancyMap
 
@@ -41,7 +42,7 @@ class DistanceField(eqx.Module):
     ceiling: Float[Array, ""]
 
     @staticmethod
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def of(grid: OccupancyMap, *, ceiling: float | Float[Array, ""] = 2.0, surfaces: bool = False) -> "DistanceField":
         """The exact Euclidean field of the occupied cells of a map.
@@ -102,7 +103,7 @@ class DistanceField(eqx.Module):
         return jnp.where(outside, self.resolution * jnp.sqrt(jnp.where(outside, squared, 1.0)), 0.0)
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def squared_distances(
     occupied: Bool[Array, "rows columns"], *, dtype: Any = jnp.float32
@@ -147,7 +148,7 @@ def squared_distances(
     return lax.while_loop(lambda carry: carry[2], widen, initial)[0]
 
 
-@eqx.filter_jit
+@filter_jit
 @checked
 def trace(
     field: DistanceField,

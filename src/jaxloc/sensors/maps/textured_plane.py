@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.images.interpolation import AbstractInterpolation, Bilinear, sample
 from jaxloc.images.warps import Homography
@@ -72,7 +73,7 @@ class TexturedPlane(eqx.Module):
         columns = jnp.stack([self.resolution * matrix[:3, 0], self.resolution * matrix[:3, 1], matrix[:3, 3]], axis=1)
         return Homography.from_matrix(matmul(camera.matrix(), columns))
 
-    @eqx.filter_jit
+    @filter_jit
     @checked
     def predict(
         self,

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxloc._jit import filter_jit
 from jaxloc.beliefs import Gaussian
 from jaxloc.filters.interface import Filter, FilterState
 from jaxloc.poses.lie_group import as_floats
@@ -143,14 +144,14 @@ class DescriptorFastSlam(Filter):
         none = Appearances(jnp.zeros((capacity, self.length), dtype), jnp.zeros(capacity, dtype))
         return DescriptorSlamState(slam, none)
 
-    @eqx.filter_jit
+    @filter_jit
     def predict(
         self, state: DescriptorSlamState, control: Any, *, key: Key[Array, ""] | None = None
     ) -> DescriptorSlamState:
         """Predicts all particles."""
         return DescriptorSlamState(self.slam.predict(state.slam, control, key=key), state.appearances)
 
-    @eqx.filter_jit
+    @filter_jit
     def update(
         self,
         state: DescriptorSlamState,

@@ -11,6 +11,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc import _tree as tree
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs import Gaussian, Motion, Particles, resampling, validity
 from jaxloc.filters.interface import Filter, Info, conclude
@@ -106,7 +107,7 @@ class FastSlam(Filter):
         weights = jnp.full(n, -math.log(n), dtype)
         return FastSlamState(poses, pending, maps, weights, jnp.zeros((), jnp.int32))
 
-    @eqx.filter_jit
+    @filter_jit
     def predict(self, state: FastSlamState, control: Any, *, key: Key[Array, ""] | None = None) -> FastSlamState:
         """Predicts all particles; the motion noise stays pending until the next reading.
 
@@ -137,7 +138,7 @@ class FastSlam(Filter):
         moved = FastSlamState(poses, pending, particles.known, state.log_weights, state.step + 1)
         return _is_usable(moved), moved
 
-    @eqx.filter_jit
+    @filter_jit
     def update(
         self,
         state: FastSlamState,
@@ -218,7 +219,7 @@ def _is_usable(state: FastSlamState) -> Bool[Array, ""]:
     return tree.within_range((state.poses, state.pending, state.maps))
 
 
-@eqx.filter_jit
+@filter_jit
 def trace_back(poses: SE2, ancestors: Int[Array, "t n"], particle: Int[Array, ""]) -> SE2:
     """Path of one of the final particles, from the poses and ancestors of each update [R-18].
 

@@ -9,6 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxloc._jit import filter_jit
 from jaxloc.images.interpolation import Bicubic, Bilinear, sample_components
 from jaxloc.poses import SE2
 from jaxloc.slam.mosaic.raster import Raster
@@ -34,7 +35,7 @@ class Exposure(eqx.Module):
         return Exposure(jnp.ones(count, dtype), jnp.zeros(count, dtype))
 
 
-@eqx.filter_jit
+@filter_jit
 def balance(
     first: Int[Array, " m"], second: Int[Array, " m"], overlaps: Overlap, valid: Bool[Array, " m"], *, count: int
 ) -> Exposure:
@@ -107,7 +108,7 @@ def enclose(poses: SE2, patch: Raster, *, margin: float = 0.0) -> Raster:
     return Raster(jnp.asarray(low, patch.origin.dtype), patch.resolution, (rows, columns))
 
 
-@eqx.filter_jit
+@filter_jit
 def blend(
     patches: Patch,
     poses: SE2,

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.alignment.correlation import Window, search
 from jaxloc.images.interpolation import Bilinear, sample_components
@@ -16,7 +17,7 @@ from jaxloc.slam.mosaic.view import Patch
 from jaxloc.solvers import Estimate, GemanMcClure, Linearization, Problem, Quadratic, solve
 
 
-@eqx.filter_jit
+@filter_jit
 def feature_jacobian(T_i_j: SE2, points_j: Float[Array, "n 2"]) -> Float[Array, "n 2 3"]:
     """How features of frame j move in frame i with the parameters (a_j, b_j, theta_j) of the pose between them.
 
@@ -75,7 +76,7 @@ class FeaturePairs(Problem):
         return Linearization(self.residual(state), jnp.where(self.valid[None, None], jacobian, 0.0))
 
 
-@eqx.filter_jit
+@filter_jit
 def pose_from_features(
     points_i: Float[Array, "n 2"],
     points_j: Float[Array, "n 2"],
@@ -131,7 +132,7 @@ class Squares(eqx.Module):
     reach: int = eqx.field(static=True, default=24)
 
 
-@eqx.filter_jit
+@filter_jit
 def register_squares(first: Patch, second: Patch, predicted: SE2, *, squares: Squares = Squares()) -> Estimate:
     """Estimates the pose between two cameras over a floor from squares of the second patch, matched in the first.
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxloc import _linalg
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.alignment.lucas_kanade import LucasKanade, Pyramid, align
 from jaxloc.images.interpolation import AbstractInterpolation, Bilinear, sample_components
@@ -46,7 +47,7 @@ class Registration(eqx.Module):
     overlap: Overlap
 
 
-@eqx.filter_jit
+@filter_jit
 def register(first: Patch, second: Patch, predicted: SE2, *, method: LucasKanade = PAIRWISE) -> Registration:
     """Estimates the pose of one camera over a floor in the frame of another by image alignment.
 

@@ -2,12 +2,12 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc.alignment.lucas_kanade import LucasKanade, Pyramid, align
 from jaxloc.images.warps import Euclidean
 from jaxloc.poses import SE2
@@ -23,7 +23,7 @@ TRACKING = LucasKanade(
 )
 
 
-@eqx.filter_jit
+@filter_jit
 def track(
     mosaic: Patch,
     image: Num[Array, "h w"] | Any,

@@ -9,6 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.images.interpolation import AbstractInterpolation, Bicubic, sample_components
 from jaxloc.images.normalization import as_gray
@@ -59,7 +60,7 @@ class RadialFalloff(Falloff):
         return jnp.exp(jnp.minimum(square * (first + square * (second + square * third)), 1.0))
 
 
-@eqx.filter_jit
+@filter_jit
 def fit_falloff(frames: Num[Array, "n h w"] | Any, *, black: Any = 0.0) -> RadialFalloff:
     """Estimates vignetting from images of many places, as what they have in common.
 
@@ -146,7 +147,7 @@ class Rectifier(eqx.Module):
     raster: Raster
     interpolation: AbstractInterpolation
 
-    @eqx.filter_jit
+    @filter_jit
     def rectify(self, image: Num[Array, "h w"] | Any) -> Patch:
         """The floor in an image: ``(image(u, v) - black) / shade`` [K-81, K-84].
 
@@ -174,7 +175,7 @@ class Rectifier(eqx.Module):
         weight = jnp.where(known, self.shade**2 * jnp.clip(border / _TAPER, 0.0, 1.0), 0.0)
         return Patch(light.reshape(self.raster.shape), weight.reshape(self.raster.shape), self.raster)
 
-    @eqx.filter_jit
+    @filter_jit
     def rectify_all(self, images: Num[Array, "n h w"] | Any) -> Patch:
         """The floor in many images: values and weights stacked, one raster for all."""
 
@@ -258,7 +259,7 @@ class FloorView(eqx.Module):
         corner = self.raster.origin + self.raster.resolution * jnp.array(cut[::-1], self.raster.origin.dtype)
         return eqx.tree_at(lambda view: view.raster, self, Raster(corner, self.raster.resolution, shape))
 
-    @eqx.filter_jit
+    @filter_jit
     def rectifier(self) -> Rectifier:
         """Rectification maps, computed once for all images."""
         x, y = (axis.reshape(-1) for axis in self.raster.centers())

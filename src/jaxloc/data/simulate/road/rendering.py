@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32
 
+from jaxloc._jit import filter_jit
 from jaxloc.data.simulate.road.geometry import RoadGeometry, SmallAngles
 from jaxloc.lanes.lane import Lane
 from jaxloc.sensors.ground_camera import GroundCamera
@@ -245,7 +246,7 @@ def render(
     return np.clip(image, 0.0, 255.0)
 
 
-@eqx.filter_jit
+@filter_jit
 def _look(
     ground: GroundCamera, u: Float[Array, " n"], v: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Bool[Array, " n"]]:
