@@ -1,5 +1,6 @@
 """Triangulation from several views: midpoint, optimal correction of two views, and maximum likelihood."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -7,15 +8,71 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _tree as tree
 from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
+from jaxloc.beliefs import validity
 from jaxloc.poses import SE3
 from jaxloc.sensors import Pinhole
-from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Loss, Problem, Quadratic, solve
+from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Loss, Problem, Quadratic, Status, solve
 from jaxloc.solvers.cholesky import factor
 
 # Residual of a point behind a camera, sigmas.
 _UNSEEN = 1e3
+
+
+def positive(sigma: Array) -> Bool[Array, "..."]:
+    """Which standard deviations can be used: positive, finite, and with a finite square of their inverse.
+
+    Example:
+        >>> positive(jnp.array([0.5, 0.0, -1.0, jnp.nan, jnp.inf])).tolist()
+        [True, False, False, False, False]
+    """
+    sigma = jax.lax.stop_gradient(sigma)
+    return jnp.isfinite(sigma) & (sigma > float(jnp.finfo(sigma.dtype).max) ** -0.5)
+
+
+def guarded(usable: Bool[Array, ""], estimate: Callable[..., Any], *args: Any) -> Any:
+    """``estimate(*args)``; where it is not usable, ``ok`` is False, numbers are finite, and derivatives are zero.
+
+    The guard of one-shot estimators against numbers that only the result shows to be too large, as `_tree.protect`
+    is that of filters. What an estimator itself says is kept.
+
+    Args:
+        usable: whether the inputs can be used, such as a standard deviation (see `positive`).
+        estimate: returns a record with a flag ``ok``, and a `Status` where it has one, or holds one as ``estimate``.
+        args: of it. Masks and integers are given here, not closed over.
+
+    Returns:
+        The record.
+
+    Example:
+        >>> def far(x):
+        ...     return jl.solvers.align_points(x * jnp.eye(3), jnp.eye(3))
+        >>> import jaxloc as jl
+        >>> bool(guarded(jnp.array(True), far, jnp.array(1.0)).ok), bool(guarded(jnp.array(False), far, 1.0).ok)
+        (True, False)
+    """
+
+    def run(usable: Bool[Array, ""], *args: Any) -> tuple[Bool[Array, ""], Any]:
+        whole = estimate(*args)
+        found = getattr(whole, "estimate", whole)
+        finite = tree.all_finite(found)
+        ok = found.ok & usable & finite
+        if hasattr(found, "status"):
+            status = jnp.where(found.ok & ~usable, int(Status.INADMISSIBLE), found.status)
+            status = jnp.where(finite, status, int(Status.NONFINITE)).astype(found.status.dtype)
+            found = eqx.tree_at(lambda record: record.status, found, status)
+        found = eqx.tree_at(lambda record: record.ok, found, ok)
+        return ok, found if found is whole or not hasattr(whole, "estimate") else eqx.tree_at(_inner, whole, found)
+
+    ok, whole = tree.protect(run, usable, *args)
+    # Also where it is ok: derivatives of what is finite alone pass.
+    return tree.where(ok, whole, validity.finite_or_neutral(whole))
+
+
+def _inner(record: Any) -> Any:
+    return record.estimate
 
 
 @eqx.filter_jit
@@ -166,7 +223,7 @@ def triangulate(
         poses: ``T_world_camera``, a stack of n.
         pixels: measurements of the point, px.
         sigma: standard deviation of a pixel coordinate, px: a number or one an image.
-        valid: images that are used; non-finite pixels never are.
+        valid: images that are used; non-finite pixels never are, nor those without a positive finite sigma.
         loss: robust kernel over the two coordinates of an image.
 
     Returns:
@@ -189,8 +246,9 @@ def triangulate(
     """
     finite = jnp.all(jnp.isfinite(pixels), axis=1)
     valid = finite if valid is None else finite & valid
-    pixels = jnp.where(valid[:, None], pixels, 0.0)
     sigmas = jnp.broadcast_to(jnp.asarray(sigma, pixels.dtype), valid.shape)
+    valid = valid & positive(sigmas)
+    pixels, sigmas = jnp.where(valid[:, None], pixels, 0.0), jnp.where(valid, sigmas, 1.0)
     problem = TriangulationProblem(camera, poses, pixels.T, sigmas, valid, loss)
     return solve(problem, _initial(problem), solver=LevenbergMarquardt())
 
