@@ -24,9 +24,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxloc._arguments import checked
+from jaxloc.multiview.triangulation import guarded
 from jaxloc.poses import SE2, SE3
 from jaxloc.refinement.feature_pairs import (
     LineLine,
@@ -149,4 +151,8 @@ def refine(
         found = jax.tree.leaves(pairs)[0].shape[0]
         if found != size:
             raise ValueError(f"{type(pairs).__name__} holds features of {found} coordinates, the pose has {size}.")
-    return solve(Mixed(correspondences, loss), initial, solver=solver)
+
+    def run(correspondences: Correspondences, initial: SE2 | SE3, loss: Any) -> Estimate:
+        return solve(Mixed(correspondences, loss), initial, solver=solver)
+
+    return guarded(jnp.array(True), run, correspondences, initial, loss)

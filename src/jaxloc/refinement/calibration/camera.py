@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
+from jaxloc.multiview.triangulation import guarded, positive
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration.model import Intrinsics, Parametrization
 from jaxloc.refinement.calibration.problem import BoardProblem, CameraProblem, Unknowns
@@ -92,7 +93,22 @@ def calibrate(
         (True, 500, 510)
     """
     check_corners(board, corners)
-    model, problem, initial = prepare(finite_views(board, corners, valid), intrinsics, shape, loss)
+
+    def run(board: Array, corners: Array, valid: Any, sigma: Any, loss: Any) -> Estimate:
+        return _calibrate(finite_views(board, corners, valid), intrinsics, shape, sigma, loss, solver)
+
+    return guarded(is_usable(sigma, board.dtype), run, board, corners, valid, sigma, loss)
+
+
+def is_usable(sigma: Any, dtype: Any) -> Bool[Array, ""]:
+    """Whether a standard deviation is positive and finite, or is to be estimated."""
+    return jnp.array(True) if sigma is None else positive(jnp.asarray(sigma, dtype))
+
+
+def _calibrate(
+    views: Views, intrinsics: Intrinsics, shape: tuple[int, int] | None, sigma: Any, loss: Any, solver: Solver
+) -> Estimate:
+    model, problem, initial = prepare(views, intrinsics, shape, loss)
     found = fit(problem, initial, sigma, solver)
     value = Calibrated(model.camera(found.value.shared), found.value.boards)
     return transform_estimate(found, value, model.basis())

@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Num
 
 from jaxloc._arguments import checked
+from jaxloc.multiview.triangulation import guarded
 from jaxloc.poses import SE2
 from jaxloc.refinement.pallet.edges import (
     LevelView,
@@ -139,7 +140,10 @@ def detect_pallet(
     Raises:
         ValueError: no types.
     """
-    kinds = stack_types(types)
+    return guarded(jnp.array(True), _detect, image, camera, stack_types(types), search)
+
+
+def _detect(image: Array, camera: GroundCamera, kinds: PalletType, search: PalletSearch) -> FoundPallet:
     view = level_view(image, camera)
     sums = summed(view.slope)
     fixed = lax.stop_gradient((view, sums))

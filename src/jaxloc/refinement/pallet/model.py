@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
+from jaxloc.multiview.triangulation import guarded, positive
 from jaxloc.poses import SE2
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Problem, Quadratic, solve
@@ -255,9 +256,14 @@ def pose_from_edges(
     dtype = bearings.dtype
     sigmas = jnp.broadcast_to(jnp.asarray(sigma, dtype), bearings.shape)
     focal, edges = jnp.asarray(focal, dtype), kind.edges().astype(dtype)
+    usable = usable & positive(sigmas)
     whitening = jnp.where(usable, 1.0 / jnp.where(usable, sigmas, 1.0), 0.0)
     first = _frontal(edges, bearings, focal, usable) if initial is None else initial
-    return solve(PalletEdges(edges, bearings, focal, whitening), first, solver=LevenbergMarquardt())
+
+    def run(problem: PalletEdges, first: SE2) -> Estimate:
+        return solve(problem, first, solver=LevenbergMarquardt())
+
+    return guarded(jnp.array(True), run, PalletEdges(edges, bearings, focal, whitening), first)
 
 
 def _frontal(edges: Array, bearings: Array, focal: Array, usable: Array) -> SE2:
