@@ -67,6 +67,7 @@ def tracked(p):
 WIDE_V, WIDE_U = np.meshgrid(np.arange(64.0), np.arange(64.0), indexing="ij")
 TEXTURE = 100.0 * np.asarray(smooth(jax.random.normal(jax.random.key(0), (64, 64)), 1.0))
 HUGE = {".*(largest|1e30)": "spectra of huge numbers overflow"}
+BRIEF = A.mutual_information.MutualInformation(blurs=(1.0,), max_steps=12)
 CASES = {
     "lucas_kanade.align.align": Case(
         lambda p: A.lucas_kanade.align(
@@ -91,7 +92,9 @@ CASES = {
         numbers=START,
     ),
     "mutual_information.align.align": Case(
-        lambda p: A.mutual_information.align(p["image"], p["template"], Translation, moved(p), mask=p["valid"]),
+        lambda p: A.mutual_information.align(
+            p["image"], p["template"], Translation, moved(p), method=BRIEF, mask=p["valid"]
+        ),
         images=IMAGES,
         numbers=START,
         # The information with another image may have a maximum.
