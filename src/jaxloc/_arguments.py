@@ -23,7 +23,7 @@ def checked(function: _Function) -> _Function:
     are not seen.
 
     Args:
-        function: annotated; decorate it below ``eqx.filter_jit`` and ``staticmethod``.
+        function: annotated; decorate it below `filter_jit` and ``staticmethod``.
 
     Returns:
         The function, which raises a ValueError for a wrong shape and a TypeError for something else than an array or

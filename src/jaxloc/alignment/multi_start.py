@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc._jit import filter_jit
-from jaxloc.alignment.lucas_kanade.align import finish, initial_warp, prepare, search
+from jaxloc.alignment.lucas_kanade.align import finish, finite_warp, initial_warp, prepare, search
 from jaxloc.alignment.lucas_kanade.covariance import AlignmentData
 from jaxloc.alignment.lucas_kanade.iteration import SearchResult
 from jaxloc.alignment.lucas_kanade.normal_equations import Prepared, equations, zero_brightness
@@ -87,9 +87,10 @@ def _align(data: AlignmentData, initial: Warp, keep: int) -> Estimate:
     detached = jax.lax.stop_gradient(data)
     coarsest, *finer = detached.levels()
     brightness = zero_brightness(coarsest)
-    matrices = jax.vmap(lambda one: data.frame.normalize(one))(jax.lax.stop_gradient(initial))
+    initial, finite = jax.vmap(finite_warp)(initial)
+    matrices = jax.vmap(lambda one: data.frame.normalize(one))(initial)
     first = jax.vmap(lambda one: search(detached, [coarsest], one, brightness))(matrices)
-    cost = jax.vmap(lambda found: _cost(detached, coarsest, found))(first)
+    cost = jnp.where(finite, jax.vmap(lambda found: _cost(detached, coarsest, found))(first), jnp.inf)
     chosen = jnp.argsort(cost)[:keep]
     few = jax.tree.map(lambda leaf: leaf[chosen], first)
     if finer:
@@ -97,7 +98,7 @@ def _align(data: AlignmentData, initial: Warp, keep: int) -> Estimate:
         few = eqx.tree_at(lambda found: found.num_steps, then, then.num_steps + few.num_steps)
     last = finer[-1] if finer else coarsest
     best = jnp.argmin(jax.vmap(lambda found: _cost(detached, last, found))(few))
-    return finish(data, jax.tree.map(lambda leaf: leaf[best], few), jnp.array(True))
+    return finish(data, jax.tree.map(lambda leaf: leaf[best], few), jnp.any(finite))
 
 
 def _cost(data: AlignmentData, level: Level, found: SearchResult) -> Float[Array, ""]:

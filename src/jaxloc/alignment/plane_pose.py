@@ -3,11 +3,13 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
+from jaxloc.beliefs.validity import positive
 from jaxloc.images.interpolation import Bicubic, sample_components
 from jaxloc.images.normalization import as_gray
 from jaxloc.images.pyramid import gaussian_pyramid
@@ -15,6 +17,7 @@ from jaxloc.poses import SE3
 from jaxloc.sensors import Pinhole, TexturedPlane
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Problem, Quadratic, solve
 from jaxloc.solvers.cholesky import factor
+from jaxloc.solvers.estimate import guarded
 
 
 class Appearance(eqx.Module):
@@ -36,7 +39,8 @@ class PlaneAppearance(Problem):
 
     Attributes:
         camera: of the image at this scale.
-        image: gray levels.
+        image: gray levels, finite everywhere.
+        known: pixels around which it was finite.
         points: of the map, world frame, "3 n".
         values: of the map there, zero mean and unit variance.
         contrast: standard deviation of the map's gray levels.
@@ -47,6 +51,7 @@ class PlaneAppearance(Problem):
 
     camera: Pinhole
     image: Float[Array, "h w"]
+    known: Bool[Array, "h w"]
     points: Float[Array, "3 n"]
     values: Float[Array, " n"]
     contrast: Float[Array, ""]
@@ -61,7 +66,8 @@ class PlaneAppearance(Problem):
         front = self.camera.in_front_components(x, y, z)
         u, v = self.camera.project_components(x, y, z)
         values, inside = sample_components(self.image, u, v, method=Bicubic())
-        known = front & inside & jnp.isfinite(values)
+        column, row = (jnp.where(inside, jax.lax.stop_gradient(c), 0.0).round().astype(jnp.int32) for c in (u, v))
+        known = front & inside & self.known[row, column] & jnp.isfinite(values)
         return jnp.where(known, values, 0.0), known
 
     def residual(self, state: Appearance) -> Float[Array, " n"]:
@@ -117,11 +123,19 @@ def refine_pose(
         >>> bool(fit.ok), bool(jnp.linalg.norm(fit.value.translation - truth.translation) < 0.01)
         (True, True)
     """
+    sigma = jnp.asarray(sigma, plane.texture.dtype)
+    usable = positive(sigma)
+    given = image, plane, camera, initial, jnp.where(usable, sigma, 1.0), loss
+    return guarded(usable, lambda *given: _refine(*given, levels, stride), *given)
+
+
+def _refine(
+    image: Any, plane: TexturedPlane, camera: Pinhole, initial: SE3, sigma: Array, loss: Any, levels: int, stride: int
+) -> Estimate:
     image = as_gray(image, plane.texture.dtype)
     images, maps = gaussian_pyramid(image, levels=levels), gaussian_pyramid(plane.texture, levels=levels)
     one = jnp.ones((), image.dtype)
     state = Appearance(initial, one, jnp.zeros_like(one))
-    sigma = jnp.asarray(sigma, image.dtype)
     fit, problem = None, None
     for level in reversed(range(levels)):
         problem = _problem(images[level], maps[level], plane, camera, level, sigma, loss, stride if level == 0 else 1)
@@ -150,7 +164,11 @@ def _problem(
     contrast = jnp.where(contrast > 0, contrast, 1.0)
     focal = camera.fx / shrink, camera.fy / shrink
     scaled = Pinhole(*focal, camera.cx / shrink, camera.cy / shrink, camera.skew / shrink, camera.lens)
-    return PlaneAppearance(scaled, image, points.T, (values - mean) / contrast, contrast, mean, sigma, loss)
+    # NaN would pass to the derivatives through any later mask; interpolation reaches two pixels.
+    finite = jnp.isfinite(image)
+    known = jax.lax.reduce_window(finite, True, jax.lax.bitwise_and, (5, 5), (1, 1), "SAME")
+    image = jnp.where(finite, image, 0.0)
+    return PlaneAppearance(scaled, image, known, points.T, (values - mean) / contrast, contrast, mean, sigma, loss)
 
 
 def _pose_of(fit: Estimate, problem: PlaneAppearance) -> Estimate:

@@ -129,3 +129,14 @@ def usable_or_unknown(mean: Any, covariance: Float[Array, "d d"]) -> tuple[Any, 
         ([2.0], [[1.0]])
     """
     return tree.where(usable(mean, covariance), (mean, covariance), unknown(mean, covariance))
+
+
+def positive(sigma: Array) -> Bool[Array, "..."]:
+    """Which standard deviations can be used: positive, finite, and with a finite square of their inverse.
+
+    Example:
+        >>> positive(jnp.array([0.5, 0.0, -1.0, jnp.nan, jnp.inf])).tolist()
+        [True, False, False, False, False]
+    """
+    sigma = lax.stop_gradient(sigma)
+    return jnp.isfinite(sigma) & (sigma > float(jnp.finfo(sigma.dtype).max) ** -0.5)

@@ -5,7 +5,7 @@ null vectors and roots are found without derivatives, and one Newton step on the
 of the implicit function.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,6 +19,7 @@ from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.multiview.epipolar import homogeneous
 from jaxloc.multiview.homography import normalizer
+from jaxloc.solvers.estimate import guarded
 
 _LEAST, _MINIMAL = 8, 7
 _POLISH_STEPS = 3
@@ -94,6 +95,10 @@ def eight_point(
     """
     if first.shape[0] < _LEAST:
         raise ValueError(f"The eight-point algorithm needs {_LEAST} pairs; there are {first.shape[0]}.")
+    return guarded(jnp.array(True), _eight_point, first, second, weights, valid)
+
+
+def _eight_point(first: Array, second: Array, weights: Any, valid: Any) -> FundamentalMatrix:
     used, first, second, weight = _usable(first, second, weights, valid)
     (to_first, x1), (to_second, x2) = (_normalized(points.T, used) for points in (first, second))
     rows = (x1[:, None] * x2[None]).reshape(9, -1) * jnp.sqrt(weight)[None, :]

@@ -1,5 +1,7 @@
 """Stereo rectification: of calibrated pairs by rotations, of uncalibrated ones by homographies."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -7,12 +9,14 @@ from jaxtyping import Array, Bool, Float
 from jaxloc._arguments import checked
 from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
+from jaxloc.beliefs.validity import positive
 from jaxloc.images import Homography
 from jaxloc.multiview.epipolar import null_vector
 from jaxloc.poses import SE3, SO3
 from jaxloc.poses.lie_group import skew
 from jaxloc.sensors import Pinhole, StereoRig
 from jaxloc.solvers.cholesky import factor
+from jaxloc.solvers.estimate import guarded
 
 
 class Rectification(eqx.Module):
@@ -60,6 +64,11 @@ def rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, *, shape: tuple[in
         >>> bool(found.ok), round(float(found.rig.baseline), 4)
         (True, 0.2)
     """
+    usable = positive(left.fx) & positive(left.fy) & positive(right.fx) & positive(right.fy)
+    return guarded(usable, lambda *cameras: _rectify(*cameras, shape), left, right, T_left_right)
+
+
+def _rectify(left: Pinhole, right: Pinhole, T_left_right: SE3, shape: tuple[int, int]) -> Rectification:
     half = SO3.exp(0.5 * T_left_right.rotation.log())
     # The baseline in the frame of the mean orientation of both cameras.
     between = half.inverse().apply(T_left_right.translation[None])[0]
@@ -166,6 +175,13 @@ def rectifying_homographies(
         >>> bool(pair.ok), bool(jnp.allclose(pair.second.matrix(), jnp.eye(3), atol=1e-4))
         (True, True)
     """
+    given = fundamental, first, second, valid
+    return guarded(jnp.array(True), lambda *given: _rectifying_homographies(*given, shape), *given)
+
+
+def _rectifying_homographies(
+    fundamental: Array, first: Array, second: Array, valid: Any, shape: tuple[int, int]
+) -> RectifyingPair:
     finite = jnp.all(jnp.isfinite(first), axis=1) & jnp.all(jnp.isfinite(second), axis=1)
     weight = (finite if valid is None else finite & valid).astype(first.dtype)
     first, second = (jnp.where(weight[:, None] > 0, points, 0.0) for points in (first, second))

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 from jaxloc._arguments import checked
 from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
+from jaxloc.beliefs.validity import positive
 from jaxloc.poses import SE3
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Loss, Problem, Quadratic, solve
@@ -166,7 +167,7 @@ def triangulate(
         poses: ``T_world_camera``, a stack of n.
         pixels: measurements of the point, px.
         sigma: standard deviation of a pixel coordinate, px: a number or one an image.
-        valid: images that are used; non-finite pixels never are.
+        valid: images that are used; non-finite pixels never are, nor those without a positive finite sigma.
         loss: robust kernel over the two coordinates of an image.
 
     Returns:
@@ -189,8 +190,9 @@ def triangulate(
     """
     finite = jnp.all(jnp.isfinite(pixels), axis=1)
     valid = finite if valid is None else finite & valid
-    pixels = jnp.where(valid[:, None], pixels, 0.0)
     sigmas = jnp.broadcast_to(jnp.asarray(sigma, pixels.dtype), valid.shape)
+    valid = valid & positive(sigmas)
+    pixels, sigmas = jnp.where(valid[:, None], pixels, 0.0), jnp.where(valid, sigmas, 1.0)
     problem = TriangulationProblem(camera, poses, pixels.T, sigmas, valid, loss)
     return solve(problem, _initial(problem), solver=LevenbergMarquardt())
 

@@ -24,6 +24,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxloc._arguments import checked
@@ -39,6 +40,7 @@ from jaxloc.refinement.feature_pairs import (
     nearest_on_segment,
 )
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Problem, Quadratic, Solver, solve
+from jaxloc.solvers.estimate import guarded
 
 __all__ = [
     "Correspondences",
@@ -150,4 +152,8 @@ def refine(
         found = jax.tree.leaves(pairs)[0].shape[0]
         if found != size:
             raise ValueError(f"{type(pairs).__name__} holds features of {found} coordinates, the pose has {size}.")
-    return solve(Mixed(correspondences, loss), initial, solver=solver)
+
+    def run(correspondences: Correspondences, initial: SE2 | SE3, loss: Any) -> Estimate:
+        return solve(Mixed(correspondences, loss), initial, solver=solver)
+
+    return guarded(jnp.array(True), run, correspondences, initial, loss)

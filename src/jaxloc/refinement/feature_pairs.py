@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jaxloc._arguments import checked
 from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
+from jaxloc.beliefs.validity import positive
 from jaxloc.poses import SE2, SE3
 from jaxloc.solvers import Linearization
 
@@ -222,7 +223,7 @@ def _packed(features: tuple[Array, ...], sigma: Any, valid: Bool[Array, " n"] | 
         raise ValueError(f"Features of a pair have one shape, (n, 2) or (n, 3); these have {sorted(shapes)}.")
     dtype = features[0].dtype
     sigmas = jnp.broadcast_to(jnp.asarray(sigma, dtype), features[0].shape[:1])
-    usable = (sigmas > 0) & jnp.isfinite(sigmas)
+    usable = positive(sigmas)
     usable = usable if valid is None else usable & valid
     for feature in features:
         usable = usable & jnp.all(jnp.isfinite(feature), axis=1)

@@ -29,6 +29,7 @@ from jaxloc import _tree as tree
 from jaxloc._arguments import checked
 from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
+from jaxloc.beliefs.validity import positive
 from jaxloc.poses import Direction
 from jaxloc.refinement.interaction_matrix import (
     DirectionalFlow,
@@ -41,6 +42,7 @@ from jaxloc.refinement.interaction_matrix import (
 )
 from jaxloc.solvers import Estimate, GaussNewton, LevenbergMarquardt, Quadratic, Status, solve
 from jaxloc.solvers.cholesky import factor
+from jaxloc.solvers.estimate import guarded
 from jaxloc.solvers.problem import is_quadratic, normal_equations
 
 __all__ = [
@@ -76,7 +78,7 @@ def twist_from_flow(
         flow: their velocities, 1/s.
         depth: along the optical axis, m, for example by stereo; without it the speed is unobservable.
         sigma: standard deviation of a component of the flow, 1/s: a number or one a point.
-        valid: points that are used. Non-finite values and depths that are not positive never are.
+        valid: points that are used. Non-finite values, and depths and sigmas that are not positive never are.
         loss: robust kernel over the two components of a point.
 
     Returns:
@@ -95,6 +97,10 @@ def twist_from_flow(
         >>> bool(fit.ok), round(float(fit.value[2]), 3), round(float(fit.value[4]), 3)
         (True, 1.0, 0.1)
     """
+    return guarded(jnp.array(True), _twist, points, flow, depth, sigma, valid, loss)
+
+
+def _twist(points: Array, flow: Array, depth: Array, sigma: Any, valid: Any, loss: Any) -> Estimate:
     usable = jnp.isfinite(depth) & (depth > 0)
     points, flow, whitening = _usable(points, flow, sigma, usable if valid is None else usable & valid)
     inverse = jnp.where(whitening > 0, 1.0 / jnp.where(whitening > 0, depth, 1.0), 0.0)
@@ -137,6 +143,10 @@ def rotation_from_flow(
         >>> [round(float(w), 3) for w in rotation_from_flow(points, flow).value]
         [0.1, 0.2, 0.3]
     """
+    return guarded(jnp.array(True), _rotation, points, flow, sigma, valid, loss)
+
+
+def _rotation(points: Array, flow: Array, sigma: Any, valid: Any, loss: Any) -> Estimate:
     points, flow, whitening = _usable(points, flow, sigma, valid)
     return _linear(FlowOfTwist(flow_parts(points)[1], flow, whitening, loss))
 
@@ -183,6 +193,10 @@ def motion_from_flow(
         >>> bool(fit.ok), [round(float(x), 2) for x in fit.value.direction.vector[1:]]
         (True, [0.6, 0.8])
     """
+    return guarded(jnp.array(True), _direction_and_rotation, points, flow, sigma, valid, loss)
+
+
+def _direction_and_rotation(points: Array, flow: Array, sigma: Any, valid: Any, loss: Any) -> Estimate:
     points, flow, whitening = _usable(points, flow, sigma, valid)
     problem = DirectionalFlow(points, flow, whitening, loss)
     fixed = jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, problem)
@@ -234,5 +248,6 @@ def _usable(points: Array, flow: Array, sigma: Any, valid: Any) -> tuple[Array, 
     usable = jnp.all(jnp.isfinite(points), axis=1) & jnp.all(jnp.isfinite(flow), axis=1)
     usable = usable if valid is None else usable & valid
     sigmas = jnp.broadcast_to(jnp.asarray(sigma, flow.dtype), usable.shape)
+    usable = usable & positive(sigmas)
     whitening = jnp.where(usable, 1.0 / jnp.where(usable, sigmas, 1.0), 0.0)
     return jnp.where(usable[None, :], points.T, 0.0), jnp.where(usable[None, :], flow.T, 0.0), whitening

@@ -10,6 +10,7 @@ from jaxloc import _tree as tree
 from jaxloc._arguments import checked
 from jaxloc._jit import filter_jit
 from jaxloc.beliefs.square_root import product
+from jaxloc.beliefs.validity import positive
 from jaxloc.poses import SE3
 from jaxloc.poses.lie_group import skew
 from jaxloc.refinement.reprojection import Reprojection
@@ -64,17 +65,20 @@ def refine_pose(
     """
     usable, points, pixels = _usable(valid, points_world, pixels)
     sigma = jnp.asarray(sigma, pixels.dtype)
-    mean = _mean(points, usable, initial)
+    sound = positive(sigma) & tree.all_finite(initial)
+    weights = _weights(points, usable, initial)
+    mean = jnp.sum(weights[:, None] * lax.stop_gradient(points), axis=0)
     center = _seen_from(initial, mean)
     problem = Reprojection(camera, points.T, pixels.T, sigma, usable, loss, center)
     fit = solve(problem, _shifted(initial, center), solver=solver)
-    vague, imprecise = _is_vague(fit, mean, _shifted(fit.value, -center)), _is_imprecise(fit, points, usable)
+    vague, imprecise = _is_vague(fit, mean, _shifted(fit.value, -center)), _is_imprecise(fit, points, weights, usable)
     fit = _about_camera(fit, center)
-    return _refuse(_refuse(fit, vague, Status.RANK_DEFICIENT), imprecise, Status.IMPRECISE)
+    fit = _refuse(_refuse(fit, vague, Status.RANK_DEFICIENT), imprecise, Status.IMPRECISE)
+    return _refuse(fit, ~sound, Status.INADMISSIBLE)
 
 
-def _mean(points: Float[Array, "n 3"], usable: Bool[Array, " n"], pose: SE3) -> Float[Array, "3"]:
-    """Mean of the usable points (the others are zero), each by what it tells about the position; no derivatives.
+def _weights(points: Float[Array, "n 3"], usable: Bool[Array, " n"], pose: SE3) -> Float[Array, " n"]:
+    """What each point tells about the position, as a share, without derivatives; zero for points that are not usable.
 
     That falls with the square of the distance: a point at the horizon must not draw the center there, at which single
     precision could not tell positions of the camera apart.
@@ -83,7 +87,7 @@ def _mean(points: Float[Array, "n 3"], usable: Bool[Array, " n"], pose: SE3) -> 
     floor = float(jnp.finfo(points.dtype).eps) ** 2
     weights = jnp.where(usable & jnp.isfinite(squared), 1.0 / jnp.maximum(squared, floor), 0.0)
     total = jnp.sum(weights)
-    return lax.stop_gradient(jnp.sum(weights[:, None] * points, axis=0) / jnp.where(total > 0.0, total, 1.0))
+    return lax.stop_gradient(weights / jnp.where(total > 0.0, total, 1.0))
 
 
 def _seen_from(pose: SE3, point: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -107,15 +111,18 @@ def _is_vague(fit: Estimate, mean: Float[Array, "3"], camera: SE3) -> Bool[Array
     return (jnp.sum(variance[3:]) > 1.0) | (jnp.sum(variance[:3]) > jnp.sum(offset * offset))
 
 
-def _is_imprecise(fit: Estimate, points: Float[Array, "n 3"], usable: Bool[Array, " n"]) -> Bool[Array, ""]:
+def _is_imprecise(
+    fit: Estimate, points: Float[Array, "n 3"], weights: Float[Array, " n"], usable: Bool[Array, " n"]
+) -> Bool[Array, ""]:
     """Whether rounding of the points moves their pixels by more than a standard deviation, in the root mean square.
 
     Points and camera move pixels alike: the information about the position, which does not depend on the frame's
-    center, is the sum over the points of what a displacement does to whitened residuals.
+    center, is the sum over the points of what a displacement does to whitened residuals; the weights divide it among
+    the points.
     """
-    size = jnp.max(jnp.where(usable[:, None], jnp.abs(points), 0.0), initial=0.0)
     # Variance of a number that was rounded to the nearest one, for each of the three coordinates.
-    variance = (size * float(jnp.finfo(points.dtype).eps)) ** 2 / 12.0
+    rounding = jnp.max(jnp.abs(points), axis=1, initial=0.0) * float(jnp.finfo(points.dtype).eps)
+    variance = jnp.sum(weights * rounding**2) / 12.0
     information = jnp.sum(jnp.diagonal(fit.information)[:3])
     return lax.stop_gradient(variance * information > 2.0 * jnp.sum(usable, dtype=points.dtype))
 

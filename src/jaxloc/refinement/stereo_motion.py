@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxloc import _tree as tree
 from jaxloc._arguments import checked
 from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
@@ -16,6 +17,7 @@ from jaxloc.refinement.pnp import _usable
 from jaxloc.refinement.reprojection import StereoReprojection, stereo_jacobian, whitener
 from jaxloc.sensors import StereoRig
 from jaxloc.solvers import Estimate, Quadratic, solve
+from jaxloc.solvers.estimate import guarded
 
 
 @filter_jit
@@ -64,11 +66,21 @@ def refine_motion(
         (True, 1.0)
     """
     matches = StereoMatches.of(previous, current, covariance_previous, covariance_current, valid)
+    return guarded(tree.within_range(initial), _refine, rig, matches, initial, loss)
+
+
+def _refine(rig: StereoRig, matches: "StereoMatches", initial: SE3, loss: Any) -> Estimate:
     # The weights depend little on the pose: those of a first fit are used in the second.
     first = solve(motion_problem(rig, matches, initial, loss), initial, max_steps=10)
     weights_at = jax.tree.map(jax.lax.stop_gradient, first.value)
     problem = motion_problem(rig, matches, weights_at, loss)
     return solve(problem, weights_at)
+
+
+def _in_range(covariance: Array) -> Bool[Array, "*n"]:
+    """Which covariances are finite, and have standard deviations in range; without derivatives."""
+    greatest = tree.largest(covariance.dtype) ** 2
+    return jnp.all(jnp.abs(jax.lax.stop_gradient(covariance)) < greatest, axis=(-2, -1))
 
 
 class StereoMatches(eqx.Module):
@@ -94,6 +106,8 @@ class StereoMatches(eqx.Module):
     ) -> "StereoMatches":
         """Matches with default covariances and mask; slots with non-finite values are invalid."""
         usable, previous, current = _usable(valid, previous, current)
+        for covariance in (covariance_previous, covariance_current):
+            usable = usable if covariance is None else usable & _in_range(covariance)
 
         def noise(covariance: Any) -> Float[Array, "n 3 3"]:
             eye = jnp.eye(3, dtype=previous.dtype)

@@ -1,5 +1,6 @@
 """Estimate: the result of one-shot estimators, a value with covariance, status and observability."""
 
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Any
 
@@ -8,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxloc import _linalg
+from jaxloc import _tree as tree
 from jaxloc._jit import filter_jit
-from jaxloc.beliefs import Gaussian
+from jaxloc.beliefs import Gaussian, validity
 from jaxloc.poses import tangent_labels
 from jaxloc.solvers.cholesky import rank_tolerance
 
@@ -114,6 +116,49 @@ class Estimate(eqx.Module):
         if not bool(jnp.all(self.ok)):
             raise ValueError(f"The estimate is not usable: {self.describe()}.")
         return self
+
+
+def guarded(usable: Bool[Array, ""], estimate: Callable[..., Any], *args: Any) -> Any:
+    """``estimate(*args)``; where it is not usable, ``ok`` is False, numbers are finite, and derivatives are zero.
+
+    The guard of one-shot estimators against numbers that only the result shows to be too large, as `_tree.protect`
+    is that of filters. What an estimator itself says is kept.
+
+    Args:
+        usable: whether the inputs can be used, such as a standard deviation (see `positive`).
+        estimate: returns a record with a flag ``ok``, and a `Status` where it has one, or holds one as ``estimate``.
+        args: of it. Masks and integers are given here, not closed over.
+
+    Returns:
+        The record.
+
+    Example:
+        >>> def far(x):
+        ...     return jl.solvers.align_points(x * jnp.eye(3), jnp.eye(3))
+        >>> import jaxloc as jl
+        >>> bool(guarded(jnp.array(True), far, jnp.array(1.0)).ok), bool(guarded(jnp.array(False), far, 1.0).ok)
+        (True, False)
+    """
+
+    def run(usable: Bool[Array, ""], *args: Any) -> tuple[Bool[Array, ""], Any]:
+        whole = estimate(*args)
+        found = getattr(whole, "estimate", whole)
+        finite = tree.all_finite(found)
+        ok = found.ok & usable & finite
+        if hasattr(found, "status"):
+            status = jnp.where(found.ok & ~usable, int(Status.INADMISSIBLE), found.status)
+            status = jnp.where(finite, status, int(Status.NONFINITE)).astype(found.status.dtype)
+            found = eqx.tree_at(lambda record: record.status, found, status)
+        found = eqx.tree_at(lambda record: record.ok, found, ok)
+        return ok, found if found is whole or not hasattr(whole, "estimate") else eqx.tree_at(_inner, whole, found)
+
+    ok, whole = tree.protect(run, usable, *args)
+    # Also where it is ok: derivatives of what is finite alone pass.
+    return tree.where(ok, whole, validity.finite_or_neutral(whole))
+
+
+def _inner(record: Any) -> Any:
+    return record.estimate
 
 
 def _describe_direction(direction: Float[Array, " d"], names: tuple[str, ...]) -> str:

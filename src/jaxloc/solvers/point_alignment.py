@@ -20,9 +20,10 @@ from jaxloc import _linalg
 from jaxloc import _tree as tree
 from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
+from jaxloc.beliefs.validity import positive
 from jaxloc.poses import SE2, SE3, SO2, SO3
 from jaxloc.solvers.cholesky import rank_tolerance
-from jaxloc.solvers.estimate import Estimate, Status
+from jaxloc.solvers.estimate import Estimate, Status, guarded
 from jaxloc.solvers.implicit_gradient import attach_gradient
 from jaxloc.solvers.least_squares import StationaryPoint, covariance
 from jaxloc.solvers.problem import Problem, normal_equations
@@ -101,6 +102,11 @@ def align_points(
         >>> bool(fit.ok), round(float(fit.value.theta), 3)
         (True, 0.5)
     """
+    sigma = jnp.asarray(sigma, source.dtype)
+    return guarded(positive(sigma), _align, source, target, weights, valid, sigma)
+
+
+def _align(source: Array, target: Array, weights: Any, valid: Any, sigma: Array) -> Estimate:
     problem, weight = _problem(source, target, weights, valid, sigma)
     value, _, determined = _umeyama(problem.source, problem.target, weight)
     return _estimate(problem, value, determined)
@@ -143,6 +149,11 @@ def align_scaled_points(
         >>> bool(fit.ok), round(float(fit.value.scale), 3)
         (True, 3.0)
     """
+    sigma = jnp.asarray(sigma, source.dtype)
+    return guarded(positive(sigma), _align_scaled, source, target, weights, valid, sigma)
+
+
+def _align_scaled(source: Array, target: Array, weights: Any, valid: Any, sigma: Array) -> Estimate:
     problem, weight = _problem(source, target, weights, valid, sigma)
     pose, scale, determined = _umeyama(problem.source, problem.target, weight)
     center = _centroid(problem.source, weight)

@@ -1,5 +1,6 @@
 """RANSAC: random sample consensus with the MSAC score, all hypotheses in one batch."""
 
+import functools
 from collections.abc import Callable
 from math import ceil, log
 from typing import Any
@@ -10,7 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxloc._jit import filter_jit
+from jaxloc._tree import detach_unless
 from jaxloc.beliefs import Gaussian
+from jaxloc.beliefs.validity import positive
 from jaxloc.solvers.estimate import Estimate
 
 
@@ -132,10 +135,10 @@ def ransac(
             level, or give it parameters by ``jax.tree_util.Partial``: a fresh lambda is compiled at every call.
         residual: distance of each item of ``data`` from a model.
         sample_size: items in a sample.
-        threshold: distance at which an item becomes an outlier, in the residual's unit.
+        threshold: distance at which an item becomes an outlier, in the residual's unit; positive.
         hypotheses: number of samples, static.
         key: random key.
-        valid: which items may be drawn and count.
+        valid: which items may be drawn and count; non-finite ones never do.
 
     Returns:
         The best model, its inliers and score.
@@ -163,6 +166,9 @@ def ransac(
     if sample_size > n:
         raise ValueError(f"A sample of {sample_size} items cannot be drawn from {n}: give more data.")
     threshold = jnp.asarray(threshold)
+    sound = positive(threshold)
+    threshold = jnp.where(sound, threshold, 1.0)
+    valid, data = _usable(valid, data)
     chosen = sample_indices(key, valid, sample_size, hypotheses)
     fits = jax.vmap(lambda index: _as_candidates(fit(jax.tree.map(lambda leaf: leaf[index], data))))(chosen)
     models, usable = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (fits.models, fits.valid))
@@ -177,7 +183,21 @@ def ransac(
     best = jnp.argmin(jnp.where(usable, costs, jnp.inf))
     model, inside = jax.tree.map(lambda leaf: leaf[best], (models, inliers))
     enough = (jnp.sum(valid) >= sample_size) & (jnp.sum(inside) > sample_size)
-    return Consensus(model, inside, costs[best], usable[best] & enough)
+    ok = usable[best] & enough & sound
+    model, cost = detach_unless(ok, (model, costs[best]))
+    return Consensus(model, inside, cost, ok)
+
+
+def _usable(valid: Bool[Array, " n"], data: Any) -> tuple[Bool[Array, " n"], Any]:
+    """The mask of finite items, and the data with the others replaced by zero."""
+    floats = jax.tree.leaves(eqx.filter(data, eqx.is_inexact_array))
+    finite = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in floats]
+    valid = functools.reduce(jnp.logical_and, finite, valid)
+    return valid, jax.tree.map(lambda leaf: jnp.where(_along(valid, leaf), leaf, jnp.zeros_like(leaf)), data)
+
+
+def _along(mask: Bool[Array, " n"], leaf: Array) -> Bool[Array, "..."]:
+    return mask.reshape(-1, *(1,) * (leaf.ndim - 1))
 
 
 def _as_candidates(fitted: Any) -> Candidates:

@@ -12,6 +12,7 @@ from jaxloc.alignment.correlation.peaks import find_peaks
 from jaxloc.alignment.correlation.scores import Score, ZeroMeanCorrelation
 from jaxloc.alignment.correlation.search import score_map
 from jaxloc.images.warps import Translation
+from jaxloc.solvers.estimate import guarded
 
 
 class Classification(eqx.Module):
@@ -63,11 +64,15 @@ def classify(
     if not jnp.shape(templates)[0]:
         raise ValueError("classify: no templates; at least one is needed.")
 
+    return guarded(jnp.array(True), lambda *given: _classify(*given, score), jnp.asarray(image), jnp.asarray(templates))
+
+
+def _classify(image: Array, templates: Array, score: Score) -> Classification:
     def best(template: Array) -> tuple[Array, Array]:
         peaks = find_peaks(score_map(image, template, score=score), count=1)
         return peaks.scores[0], peaks.uv[0]
 
-    scores, uv = jax.vmap(best)(jnp.asarray(templates))
+    scores, uv = jax.vmap(best)(templates)
     label = jnp.argmax(scores)
     others = jnp.max(jnp.where(jnp.arange(scores.shape[0]) == label, -1.0, scores))
     ok = (scores[label] > 0) & (1.0 - scores[label] <= 0.8 * (1.0 - others))

@@ -22,9 +22,11 @@ from jaxloc.alignment.correlation.scores import (
     unknown_places,
 )
 from jaxloc.alignment.correlation.shift import STEPS, refine_shift
+from jaxloc.beliefs.validity import positive
 from jaxloc.images.normalization import as_gray
 from jaxloc.images.warps import Translation
 from jaxloc.solvers import Estimate, Status
+from jaxloc.solvers.estimate import guarded
 
 _DIRECT_UP_TO = 32 * 32  # template pixels, above which Fourier transforms are faster
 
@@ -144,7 +146,8 @@ def search(
     if window is not None and any(n > m for n, m in zip(pair.template.shape, window.size, strict=True)):
         raise ValueError(f"search: a template of shape {pair.template.shape} does not fit a window of {window.size}.")
     sigma = None if sigma is None else jnp.asarray(sigma, pair.image.dtype)
-    return _search(pair, finite, window, score, sigma, max_ratio)
+    usable = jnp.array(True) if sigma is None else positive(sigma)
+    return _search(usable, pair, finite, window, score, sigma, max_ratio)
 
 
 def _validate(image: Any, template: Any, mask: Any, by: Correlator | None) -> tuple[Pair, Bool[Array, "h w"]]:
@@ -175,7 +178,11 @@ def _score_map(pair: Pair, finite: Bool[Array, "h w"], score: Score) -> Float[Ar
 
 
 @filter_jit
-def _search(pair: Pair, finite: Array, window: Window | None, score: Score, sigma: Any, max_ratio: float) -> Estimate:
+def _search(usable: Array, *given: Any) -> Estimate:
+    return guarded(usable, _locate, *given)
+
+
+def _locate(pair: Pair, finite: Array, window: Window | None, score: Score, sigma: Any, max_ratio: float) -> Estimate:
     corner, known = jnp.zeros(2, pair.image.dtype), jnp.asarray(True)
     if window is not None:
         pair, finite, corner, known = _cut(pair, finite, window)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from jaxloc import _tree as tree
 from jaxloc.images.pyramid import gaussian_pyramid
 
 _SAMPLES = 4096
@@ -60,12 +61,14 @@ def build_frame(image: Float[Array, "h w"] | UInt8[Array, "h w"], levels: int, m
 
 
 def _replace_nonfinite(image: Float[Array, "h w"] | UInt8[Array, "h w"]):
-    """The image with finite values, the mask of originally finite pixels, and whether all of them were."""
+    """The image with finite values, the mask of pixels that were finite and in range, and whether all were."""
     if not jnp.issubdtype(image.dtype, jnp.floating):
         return image.astype(jnp.float32), jnp.ones(image.shape, dtype=bool), jnp.array(True)
-    finite = jnp.isfinite(image)
-    # A single sum is finite if all pixels are, unless it overflows; only then all pixels are checked.
-    clean = jnp.isfinite(jnp.sum(image))
+    greatest = jnp.abs(lax.stop_gradient(image))
+    # Products of larger ones overflow in the sums over patches.
+    finite = greatest < tree.largest(image.dtype)
+    # The maximum of NaN is NaN, which compares as False: one reduction, nearly always of an image without such pixels.
+    clean = jnp.max(greatest, initial=0.0) < tree.largest(image.dtype)
 
     def mean_of_finite(_):
         count = jnp.maximum(jnp.sum(finite, dtype=jnp.int32), 1).astype(image.dtype)

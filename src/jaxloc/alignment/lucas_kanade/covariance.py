@@ -19,6 +19,7 @@ from jaxloc.alignment.lucas_kanade.normal_equations import Matching, Sums, gain_
 from jaxloc.alignment.lucas_kanade.options import LucasKanade
 from jaxloc.alignment.lucas_kanade.pyramid_level import Frame, Level
 from jaxloc.alignment.lucas_kanade.scales import Scaled
+from jaxloc.beliefs.validity import positive
 from jaxloc.images.warps import Warp
 from jaxloc.solvers.cholesky import factor
 from jaxloc.solvers.estimate import Status
@@ -170,6 +171,7 @@ def conclude(
     status = jnp.asarray(int(Status.CONVERGED))
     for failed, code in (
         (~converged, Status.MAX_STEPS),
+        (~(jnp.array(True) if data.sigma is None else positive(data.sigma)), Status.INADMISSIBLE),
         (~admissible, Status.INADMISSIBLE),
         (deficient, Status.RANK_DEFICIENT),
         (~finite, Status.NONFINITE),

@@ -20,6 +20,7 @@ from jaxloc.images.interpolation import Bicubic, sample
 from jaxloc.images.normalization import as_gray
 from jaxloc.images.warps import Warp
 from jaxloc.solvers import Estimate, Status
+from jaxloc.solvers.estimate import guarded
 
 
 class MutualInformation(eqx.Module):
@@ -244,6 +245,10 @@ def _climb(scale: _Scale, warp: Warp, method: MutualInformation) -> _Ascent:
 
 @filter_jit
 def _align(image: Array, template: Array, weight: Array, initial: Warp, method: MutualInformation) -> Estimate:
+    return guarded(jnp.array(True), lambda *given: _maximize(*given, method), image, template, weight, initial)
+
+
+def _maximize(image: Array, template: Array, weight: Array, initial: Warp, method: MutualInformation) -> Estimate:
     finite = jnp.all(jnp.isfinite(initial.matrix()))
     safe = tree.where(finite, initial, type(initial).identity(image.dtype))
     frame = Frame.of(template.shape)

@@ -14,7 +14,7 @@ from jaxloc.sensors import OccupancyMap
 
 _SAME_TIME = 0.02  # stamps of one instant, s
 _SAME_POSE = 2e-3  # m and rad of rounding in files
-_MOVED = 0.05  # m or rad; of a robot that stood still no two paths can be told apart
+_MOVED = 0.05  # m or rad; all paths of a robot that stands still are alike
 _NUM_CLOUDS = 6
 
 

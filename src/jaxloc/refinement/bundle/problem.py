@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxloc import _linalg
 from jaxloc._arguments import checked
 from jaxloc._linalg import matmul
+from jaxloc.beliefs.validity import positive
 from jaxloc.poses import SE3
 from jaxloc.refinement.bundle.structure import Structure
 from jaxloc.sensors import Pinhole, StereoRig
@@ -193,7 +194,7 @@ class BundleProblem(eqx.Module):
         """The problem, with observations masked that are not finite, or whose point has too few rays."""
         measured, sigma = observations.measured, observations.sigma
         camera, point = observations.camera, observations.point
-        good = jnp.all(jnp.isfinite(measured) & jnp.isfinite(sigma) & (sigma > 0), axis=1) & observations.valid
+        good = jnp.all(jnp.isfinite(measured) & positive(sigma), axis=1) & observations.valid
         cameras, points = initial.poses.batch_shape[0], initial.points.shape[0]
         good = good & (camera >= 0) & (camera < cameras) & (point >= 0) & (point < points)
         camera, point = jnp.where(good, camera, 0), jnp.where(good, point, 0)

@@ -11,13 +11,14 @@ from jaxtyping import Array, Bool, Float
 from jaxloc._arguments import checked
 from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
+from jaxloc.beliefs.validity import positive
 from jaxloc.poses import SE3
 from jaxloc.refinement.calibration.model import Intrinsics, Parametrization
 from jaxloc.refinement.calibration.problem import BoardProblem, CameraProblem, Unknowns
 from jaxloc.refinement.calibration.zhang import Views, closed_form, extent, finite_views
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Quadratic, Solver, solve
-from jaxloc.solvers.estimate import Status
+from jaxloc.solvers.estimate import Status, guarded
 from jaxloc.solvers.problem import is_quadratic
 
 _MAX_STEPS = 100
@@ -93,7 +94,22 @@ def calibrate(
         (True, 500, 510)
     """
     check_corners(board, corners)
-    model, problem, initial = prepare(finite_views(board, corners, valid), intrinsics, shape, loss)
+
+    def run(board: Array, corners: Array, valid: Any, sigma: Any, loss: Any) -> Estimate:
+        return _calibrate(finite_views(board, corners, valid), intrinsics, shape, sigma, loss, solver)
+
+    return guarded(is_usable(sigma, board.dtype), run, board, corners, valid, sigma, loss)
+
+
+def is_usable(sigma: Any, dtype: Any) -> Bool[Array, ""]:
+    """Whether a standard deviation is positive and finite, or is to be estimated."""
+    return jnp.array(True) if sigma is None else positive(jnp.asarray(sigma, dtype))
+
+
+def _calibrate(
+    views: Views, intrinsics: Intrinsics, shape: tuple[int, int] | None, sigma: Any, loss: Any, solver: Solver
+) -> Estimate:
+    model, problem, initial = prepare(views, intrinsics, shape, loss)
     found = fit(problem, initial, sigma, solver)
     value = Calibrated(model.camera(found.value.shared), found.value.boards)
     return transform_estimate(found, value, model.basis())

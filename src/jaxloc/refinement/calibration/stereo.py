@@ -12,12 +12,13 @@ from jaxloc._arguments import checked
 from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3
-from jaxloc.refinement.calibration.camera import check_corners, fit, prepare, transform_estimate
+from jaxloc.refinement.calibration.camera import check_corners, fit, is_usable, prepare, transform_estimate
 from jaxloc.refinement.calibration.model import Intrinsics
 from jaxloc.refinement.calibration.problem import CameraProblem, Rig, StereoProblem, Unknowns
 from jaxloc.refinement.calibration.zhang import finite_views
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Quadratic, solve
+from jaxloc.solvers.estimate import guarded
 
 
 class Corners(eqx.Module):
@@ -101,7 +102,17 @@ def calibrate_stereo(
         (True, 0.1)
     """
     check_corners(board, left.pixels, right.pixels)
-    sides = [prepare(finite_views(board, side.pixels, side.valid), intrinsics, shape, loss) for side in (left, right)]
+
+    def run(board: Array, left: Corners, right: Corners, sigma: Any, loss: Any) -> Estimate:
+        sides = [finite_views(board, side.pixels, side.valid) for side in (left, right)]
+        return _calibrate(*(prepare(side, intrinsics, shape, loss) for side in sides), sigma, loss)
+
+    return guarded(is_usable(sigma, board.dtype), run, board, left, right, sigma, loss)
+
+
+def _calibrate(left: tuple, right: tuple, sigma: Any, loss: Any) -> Estimate:
+    """From parametrization, problem and initial unknowns of either camera."""
+    sides = left, right
     (left_model, left_problem, _), (right_model, right_problem, _) = sides
     single = [_solve_single(problem, initial) for _, problem, initial in sides]
     initial = _join(single, [left_problem.valid, right_problem.valid])

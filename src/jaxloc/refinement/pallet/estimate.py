@@ -29,6 +29,7 @@ from jaxloc.refinement.pallet.kinds import stack_types, type_correlation
 from jaxloc.refinement.pallet.model import PalletType, pose_from_edges
 from jaxloc.sensors import GroundCamera
 from jaxloc.solvers import Estimate, Status
+from jaxloc.solvers.estimate import guarded
 
 
 class PalletSearch(eqx.Module):
@@ -140,7 +141,10 @@ def detect_pallet(
     Raises:
         ValueError: no types.
     """
-    kinds = stack_types(types)
+    return guarded(jnp.array(True), _detect, image, camera, stack_types(types), search)
+
+
+def _detect(image: Array, camera: GroundCamera, kinds: PalletType, search: PalletSearch) -> FoundPallet:
     view = level_view(image, camera)
     sums = summed(view.slope)
     fixed = lax.stop_gradient((view, sums))

@@ -18,9 +18,11 @@ from jaxtyping import Array, Bool, Float
 from jaxloc._arguments import checked
 from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
+from jaxloc.beliefs.validity import positive
 from jaxloc.poses import SE2
 from jaxloc.poses.lie_group import as_floats
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Linearization, Problem, Quadratic, solve
+from jaxloc.solvers.estimate import guarded
 
 _NEAREST = 0.05  # least distance of edges from the plane of the camera, m
 _HIDDEN = 1e3
@@ -256,9 +258,14 @@ def pose_from_edges(
     dtype = bearings.dtype
     sigmas = jnp.broadcast_to(jnp.asarray(sigma, dtype), bearings.shape)
     focal, edges = jnp.asarray(focal, dtype), kind.edges().astype(dtype)
+    usable = usable & positive(sigmas)
     whitening = jnp.where(usable, 1.0 / jnp.where(usable, sigmas, 1.0), 0.0)
     first = _frontal(edges, bearings, focal, usable) if initial is None else initial
-    return solve(PalletEdges(edges, bearings, focal, whitening), first, solver=LevenbergMarquardt())
+
+    def run(problem: PalletEdges, first: SE2) -> Estimate:
+        return solve(problem, first, solver=LevenbergMarquardt())
+
+    return guarded(jnp.array(True), run, PalletEdges(edges, bearings, focal, whitening), first)
 
 
 def _frontal(edges: Array, bearings: Array, focal: Array, usable: Array) -> SE2:
