@@ -65,16 +65,17 @@ def refine_pose(
     """
     usable, points, pixels = _usable(valid, points_world, pixels)
     sigma = jnp.asarray(sigma, pixels.dtype)
-    sound = positive(sigma) & tree.all_finite(initial)
     weights = _weights(points, usable, initial)
     mean = jnp.sum(weights[:, None] * lax.stop_gradient(points), axis=0)
     center = _seen_from(initial, mean)
     problem = Reprojection(camera, points.T, pixels.T, sigma, usable, loss, center)
     fit = solve(problem, _shifted(initial, center), solver=solver)
-    vague, imprecise = _is_vague(fit, mean, _shifted(fit.value, -center)), _is_imprecise(fit, points, weights, usable)
-    fit = _about_camera(fit, center)
-    fit = _refuse(_refuse(fit, vague, Status.RANK_DEFICIENT), imprecise, Status.IMPRECISE)
-    return _refuse(fit, ~sound, Status.INADMISSIBLE)
+    wrong = (
+        (~(positive(sigma) & tree.all_finite(initial)), Status.INADMISSIBLE),
+        (_is_imprecise(fit, points, weights, usable), Status.IMPRECISE),
+        (_is_vague(fit, mean, _shifted(fit.value, -center)), Status.RANK_DEFICIENT),
+    )
+    return _refuse(_about_camera(fit, center), wrong)
 
 
 def _weights(points: Float[Array, "n 3"], usable: Bool[Array, " n"], pose: SE3) -> Float[Array, " n"]:
@@ -127,12 +128,14 @@ def _is_imprecise(
     return lax.stop_gradient(variance * information > 2.0 * jnp.sum(usable, dtype=points.dtype))
 
 
-def _refuse(fit: Estimate, wrong: Bool[Array, ""], reason: Status) -> Estimate:
-    ok = fit.ok & ~wrong
-    status = jnp.where(fit.ok & wrong, int(reason), fit.status)
+def _refuse(fit: Estimate, wrong: tuple[tuple[Bool[Array, ""], Status], ...]) -> Estimate:
+    """The estimate, with the first of the statuses whose condition holds."""
+    conditions, reasons = zip(*wrong, strict=True)
+    status = jnp.select(conditions, [jnp.asarray(int(reason), fit.status.dtype) for reason in reasons], fit.status)
+    ok = fit.ok & (status == fit.status)
     found = fit.value, fit.covariance, fit.cost, fit.information
     value, covariance, cost, information = tree.detach_unless(ok, found)
-    return Estimate(value, covariance, cost, ok, fit.num_steps, status, information)
+    return Estimate(value, covariance, cost, ok, fit.num_steps, jnp.where(fit.ok, status, fit.status), information)
 
 
 def _about_camera(fit: Estimate, center: Float[Array, "3"]) -> Estimate:
