@@ -192,6 +192,7 @@ SEEDS = {
             ("m.pgm", "pgm", b"P5\n# map\n4 2\n200\n" + bytes(range(8))),
         )
     },
+    "ros_map.read_offset": one(MAP.format("png"), ros_map.read_offset),
     "camera_file.read_camera": one(CAMERA, camera_file.read_camera),
     "png.read_image": one(picture(".png"), png.read_image),
     "png.read_size": one(picture(".png"), png.read_size),

@@ -114,6 +114,7 @@ def test_the_template_is_tracked_where_paint_ends():
     assert np.median(errors) < 0.15
 
 
+@pytest.mark.slow
 def test_a_saved_template_detects_a_lane_without_paint():
     bare = drive(Road(shadows=None).without_marks(), camera(), 3, course=Course(interval=0.1, pitch=0.0), shape=SHAPE)
     state = init(CONFIG, camera(), SHAPE)
