@@ -96,7 +96,6 @@ def test_the_disparity_offset_of_the_street_is_zero(street):
     assert abs(float(offset.mean[0])) < 0.1
 
 
-@pytest.mark.slow
 def test_a_restored_run_gives_the_same_numbers(street, check_resumed):
     sequence, _ = street
     frames = [sequence[i] for i in range(6)]

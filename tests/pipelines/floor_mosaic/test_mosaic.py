@@ -30,6 +30,7 @@ def test_frame_errors_and_loop_closure(drive, built):
     assert np.hypot(reckoned[0], reckoned[1]) > 10 * np.hypot(after[-1, 0], after[-1, 1])
 
 
+@pytest.mark.slow
 def test_the_mosaic_is_the_floor(drive, built):
     """Gray levels against the texture at the same places, gain and bias aside: no exposure steps."""
     mosaic, texture = built.mosaic, drive.floor
