@@ -272,3 +272,25 @@ def test_recordings_against_opencv(recordings, x64, pattern, grid):
     theirs = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], 0.0, *lens.ravel()])
     parameters = camera_parameters(fit)
     assert (np.abs(np.asarray(parameters.values) - theirs) <= 3.0 * np.asarray(parameters.sigmas())).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("far", [0.9, 100.0])
+def test_the_origin_of_the_board_does_not_matter(x64, rng, far):
+    """Corners far from the origin: the same camera, the same boards, the same uncertainty of each corner."""
+    corners, shift = noisy(rng), np.array([far, -0.5 * far, 0.0])
+    near, moved = (calibrate(jnp.asarray(BOARD + s), corners, intrinsics=TWO, sigma=0.2) for s in (0.0 * shift, shift))
+    assert bool(near.ok) and bool(moved.ok)
+    np.testing.assert_allclose(numbers(moved.value.camera), numbers(near.value.camera), rtol=1e-6)
+    places = [
+        jax.vmap(lambda pose, board=BOARD + s: pose.apply(jnp.asarray(board)))(fit.value.T_camera_board)
+        for fit, s in ((near, 0.0), (moved, shift))
+    ]
+    np.testing.assert_allclose(*places, atol=1e-7)
+    size = near.covariance.shape[0] - 6 * NUM
+    np.testing.assert_allclose(moved.covariance[:size, :size], near.covariance[:size, :size], rtol=1e-4, atol=1e-12)
+    # A corner moves with the translation of its frame, and with the rotation by its lever.
+    arm = np.eye(3, 6)
+    arm[:, 3:] = -np.array([[0, -shift[2], shift[1]], [shift[2], 0, -shift[0]], [-shift[1], shift[0], 0]])
+    corner = arm @ np.asarray(moved.covariance[size : size + 6, size : size + 6]) @ arm.T
+    np.testing.assert_allclose(corner, near.covariance[size : size + 3, size : size + 3], rtol=1e-3, atol=1e-12)

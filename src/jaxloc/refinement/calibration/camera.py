@@ -13,9 +13,10 @@ from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.beliefs.validity import positive
 from jaxloc.poses import SE3
+from jaxloc.poses.lie_group import skew
 from jaxloc.refinement.calibration.model import Intrinsics, Parametrization
 from jaxloc.refinement.calibration.problem import BoardProblem, CameraProblem, Unknowns
-from jaxloc.refinement.calibration.zhang import Views, closed_form, extent, finite_views
+from jaxloc.refinement.calibration.zhang import Views, center_board, closed_form, extent, finite_views
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Quadratic, Solver, solve
 from jaxloc.solvers.estimate import Status, guarded
@@ -109,10 +110,12 @@ def is_usable(sigma: Any, dtype: Any) -> Bool[Array, ""]:
 def _calibrate(
     views: Views, intrinsics: Intrinsics, shape: tuple[int, int] | None, sigma: Any, loss: Any, solver: Solver
 ) -> Estimate:
+    center, (views,) = center_board(views)
     model, problem, initial = prepare(views, intrinsics, shape, loss)
     found = fit(problem, initial, sigma, solver)
-    value = Calibrated(model.camera(found.value.shared), found.value.boards)
-    return transform_estimate(found, value, model.basis())
+    shifts = jnp.where(views.used()[:, None], center[None, :], 0.0)
+    value = Calibrated(model.camera(found.value.shared), move_boards(found.value.boards, shifts))
+    return transform_estimate(found, value, shifts, model.basis())
 
 
 def prepare(
@@ -210,18 +213,37 @@ def _checked(found: Estimate) -> Estimate:
     return eqx.tree_at(lambda e: (e.ok, e.status), found, (found.ok & ~open_, status))
 
 
-def transform_estimate(found: Estimate, value: Any, *bases: Array) -> Estimate:
-    """Linear transform of an estimate: the first parameters are linear in the first unknowns, the others equal.
+def move_boards(boards: SE3, shifts: Float[Array, "n 3"]) -> SE3:
+    """Poses of boards from those of frames of the same axes at `shifts` on them."""
+
+    def one(pose: SE3, shift: Array) -> SE3:
+        return SE3(pose.rotation, pose.translation - pose.rotation.apply(shift[None])[0])
+
+    return jax.vmap(one)(boards, shifts)
+
+
+def transform_estimate(found: Estimate, value: Any, shifts: Float[Array, "n 3"], *bases: Array) -> Estimate:
+    """Linear transform of an estimate: of the first parameters by bases, of the boards by their shifts.
 
     Args:
         found: of the unknowns.
         value: of the parameters.
-        bases: derivatives of parameters by unknowns, block by block.
+        shifts: of the boards, see `move_boards`.
+        bases: derivatives of the first parameters by the first unknowns, block by block.
     """
-    rest = found.covariance.shape[0] - sum(basis.shape[1] for basis in bases)
-    eye = jnp.eye(rest, dtype=found.cost.dtype)
-    forward = block_diag(*bases, eye)
-    back = block_diag(*(basis / jnp.sum(basis**2, axis=0)[None, :] for basis in bases), eye)
+    eye, zero = jnp.eye(3, dtype=shifts.dtype), jnp.zeros((3, 3), shifts.dtype)
+    turned = jax.vmap(lambda shift: jnp.block([[eye, skew(shift)], [zero, eye]]))(shifts)
+    # The transpose of the inverse, which transforms information.
+    dual = jax.vmap(lambda shift: jnp.block([[eye, zero], [skew(shift), eye]]))(shifts)
+    forward = block_diag(*bases, _block_diagonal(turned))
+    back = block_diag(*(basis / jnp.sum(basis**2, axis=0)[None, :] for basis in bases), _block_diagonal(dual))
     covariance = matmul(forward, matmul(found.covariance, forward.T))
     information = matmul(back, matmul(found.information, back.T))
     return Estimate(value, covariance, found.cost, found.ok, found.num_steps, found.status, information)
+
+
+def _block_diagonal(blocks: Float[Array, "n k k"]) -> Float[Array, "d d"]:
+    count, size, _ = blocks.shape
+    every = jnp.arange(count)
+    table = jnp.zeros((count, size, count, size), blocks.dtype).at[every, :, every, :].set(blocks)
+    return table.reshape(count * size, count * size)

@@ -12,10 +12,10 @@ from jaxloc._arguments import checked
 from jaxloc._jit import filter_jit
 from jaxloc._linalg import matmul
 from jaxloc.poses import SE3, SO3
-from jaxloc.refinement.calibration.camera import check_corners, fit, is_usable, prepare, transform_estimate
+from jaxloc.refinement.calibration.camera import check_corners, fit, is_usable, move_boards, prepare, transform_estimate
 from jaxloc.refinement.calibration.model import Intrinsics
 from jaxloc.refinement.calibration.problem import CameraProblem, Rig, StereoProblem, Unknowns
-from jaxloc.refinement.calibration.zhang import finite_views
+from jaxloc.refinement.calibration.zhang import center_board, finite_views
 from jaxloc.sensors import Pinhole
 from jaxloc.solvers import Estimate, LevenbergMarquardt, Quadratic, solve
 from jaxloc.solvers.estimate import guarded
@@ -104,14 +104,15 @@ def calibrate_stereo(
     check_corners(board, left.pixels, right.pixels)
 
     def run(board: Array, left: Corners, right: Corners, sigma: Any, loss: Any) -> Estimate:
-        sides = [finite_views(board, side.pixels, side.valid) for side in (left, right)]
-        return _calibrate(*(prepare(side, intrinsics, shape, loss) for side in sides), sigma, loss)
+        center, sides = center_board(*(finite_views(board, side.pixels, side.valid) for side in (left, right)))
+        shifts = jnp.where((sides[0].used() | sides[1].used())[:, None], center[None, :], 0.0)
+        return _calibrate(*(prepare(side, intrinsics, shape, loss) for side in sides), sigma, loss, shifts)
 
     return guarded(is_usable(sigma, board.dtype), run, board, left, right, sigma, loss)
 
 
-def _calibrate(left: tuple, right: tuple, sigma: Any, loss: Any) -> Estimate:
-    """From parametrization, problem and initial unknowns of either camera."""
+def _calibrate(left: tuple, right: tuple, sigma: Any, loss: Any, shifts: Array) -> Estimate:
+    """From parametrization, problem and initial unknowns of either camera; boards move back by their shifts."""
     sides = left, right
     (left_model, left_problem, _), (right_model, right_problem, _) = sides
     single = [_solve_single(problem, initial) for _, problem, initial in sides]
@@ -128,9 +129,14 @@ def _calibrate(left: tuple, right: tuple, sigma: Any, loss: Any) -> Estimate:
     found = fit(problem, initial, sigma, LevenbergMarquardt())
     rig = found.value.shared
     value = CalibratedStereo(
-        left_model.camera(rig.left), right_model.camera(rig.right), rig.T_left_right, found.value.boards
+        left_model.camera(rig.left),
+        right_model.camera(rig.right),
+        rig.T_left_right,
+        move_boards(found.value.boards, shifts),
     )
-    return transform_estimate(found, value, left_model.basis(), right_model.basis())
+    return transform_estimate(
+        found, value, shifts, left_model.basis(), right_model.basis(), jnp.eye(SE3.dof, dtype=shifts.dtype)
+    )
 
 
 def _solve_single(problem: CameraProblem, initial: Unknowns) -> Unknowns:

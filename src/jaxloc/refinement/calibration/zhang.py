@@ -36,6 +36,18 @@ class Views(NamedTuple):
         return jnp.any(self.valid, axis=1)
 
 
+def center_board(*sides: Views) -> tuple[Float[Array, "3"], tuple[Views, ...]]:
+    """The mean of the corners that are used, and the views of the board in a frame there.
+
+    Homographies, and the unknowns about a board's origin, are badly conditioned where it is far from its corners.
+    """
+    counts = sum(jnp.sum(side.valid, axis=0, dtype=side.board.dtype) for side in sides)
+    center = jax.lax.stop_gradient(
+        jnp.sum(sides[0].board * counts[None, :], axis=1) / jnp.maximum(jnp.sum(counts), 1.0)
+    )
+    return center, tuple(Views(side.board - center[:, None], side.pixels, side.valid) for side in sides)
+
+
 class InitialCalibration(NamedTuple):
     """A camera without lens distortion, and the poses of the boards.
 
