@@ -67,8 +67,8 @@ def _replace_nonfinite(image: Float[Array, "h w"] | UInt8[Array, "h w"]):
     greatest = jnp.abs(lax.stop_gradient(image))
     # Products of larger ones overflow in the sums over patches.
     finite = greatest < tree.largest(image.dtype)
-    # The maximum of NaN is NaN, which compares as False: one reduction, nearly always of an image without such pixels.
-    clean = jnp.max(greatest, initial=0.0) < tree.largest(image.dtype)
+    # One reduction, nearly always of an image without such pixels. It bounds the largest; maxima may pass over NaN.
+    clean = jnp.sum(greatest * greatest) < tree.largest(image.dtype) ** 2
 
     def mean_of_finite(_):
         count = jnp.maximum(jnp.sum(finite, dtype=jnp.int32), 1).astype(image.dtype)
