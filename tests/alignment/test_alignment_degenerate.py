@@ -1,26 +1,19 @@
 """Every estimator of the room with degenerate numbers in every input: finite values and gradients, `ok` shows it."""
 
-import importlib.util
-from pathlib import Path
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
+import degenerate_estimates as estimates
 import jaxloc as jl
+from degenerate_estimates import Case
 from jaxloc.images import Translation
 from jaxloc.images.gradients import smooth
 from jaxloc.images.spectrum import LogPolar
 from jaxloc.poses import SE3, SO3
 from jaxloc.sensors import Pinhole, TexturedPlane
 
-_PATH = Path(__file__).parents[1] / "solvers" / "degenerate_estimates.py"
-_SPEC = importlib.util.spec_from_file_location("degenerate_estimates", _PATH)
-estimates = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(estimates)
-Case = estimates.Case
 A = jl.alignment
 RNG = np.random.default_rng(0)
 
@@ -145,16 +138,6 @@ CASES = {
 OTHERS = {"klt.track.track_frames", "klt.track.track_sequence"}
 QUICK = {"clean", "image=nan", "template equal", "image stripes", "clean again"}
 
-
-def test_every_estimator_is_here():
-    estimates.check_every_estimator_is_known("alignment", {*CASES, *OTHERS})
-
-
-def test_some_lanes():
-    estimates.check(CASES["correlation.search.search"], QUICK)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_estimators(name):
-    estimates.check(CASES[name])
+test_every_estimator_is_here, test_some_lanes, test_estimators = estimates.make_tests(
+    "alignment", CASES, quick="correlation.search.search", lanes=QUICK, others=OTHERS
+)

@@ -3,7 +3,6 @@
 `JAXLOC_MUTATIONS=1000 pytest tests/data/test_data_hostile.py` tries more.
 """
 
-import importlib.util
 import inspect
 import os
 import pkgutil
@@ -16,12 +15,8 @@ import numpy as np
 import pytest
 
 import jaxloc.data
+from hostile_seeds import SEEDS
 from jaxloc.data import DataError
-
-_SPEC = importlib.util.spec_from_file_location("hostile_seeds", Path(__file__).with_name("hostile_seeds.py"))
-hostile_seeds = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(hostile_seeds)
-SEEDS = hostile_seeds.SEEDS
 
 COUNT = int(os.environ.get("JAXLOC_MUTATIONS", "60"))
 # Words that numbers are replaced by, and bytes that are put in.

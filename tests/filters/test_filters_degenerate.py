@@ -1,18 +1,12 @@
 """Every filter of the room with degenerate numbers in every input: states and gradients are finite, `ok` shows it."""
 
-import importlib.util
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import degenerate_lanes as lanes
 import jaxloc as jl
-
-_SPEC = importlib.util.spec_from_file_location("degenerate_lanes", Path(__file__).with_name("degenerate_lanes.py"))
-lanes = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(lanes)
 
 F = jl.filters
 

@@ -1,22 +1,15 @@
 """Every estimator of the room with degenerate numbers in every input: finite values and gradients, `ok` shows it."""
 
-import importlib.util
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
+import degenerate_estimates as estimates
 import jaxloc as jl
+from degenerate_estimates import Case
 from jaxloc.poses import SE3, SO3
 from jaxloc.sensors import Pinhole
 
-_PATH = Path(__file__).parents[1] / "solvers" / "degenerate_estimates.py"
-_SPEC = importlib.util.spec_from_file_location("degenerate_estimates", _PATH)
-estimates = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(estimates)
-Case = estimates.Case
 M = jl.multiview
 
 RNG = np.random.default_rng(0)
@@ -109,16 +102,6 @@ CASES = {
 }
 QUICK = {"clean", "all masked", "[1] masked", "pixels=nan", "pixels[1]=nan", "sigma=0", "centers equal", "clean again"}
 
-
-def test_every_estimator_is_here():
-    estimates.check_every_estimator_is_known("multiview", CASES)
-
-
-def test_some_lanes():
-    estimates.check(CASES["triangulation.triangulate"], QUICK)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_estimators(name):
-    estimates.check(CASES[name])
+test_every_estimator_is_here, test_some_lanes, test_estimators = estimates.make_tests(
+    "multiview", CASES, quick="triangulation.triangulate", lanes=QUICK
+)

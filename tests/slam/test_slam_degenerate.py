@@ -1,21 +1,14 @@
 """Every SLAM filter and the pose graph with degenerate numbers: states and gradients are finite, `ok` shows it."""
 
-import importlib.util
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import degenerate_lanes as lanes
 import jaxloc as jl
 from jaxloc import _tree as tree
 from jaxloc.slam import fast_slam, pose_graph
-
-_PATH = Path(__file__).parents[1] / "filters" / "degenerate_lanes.py"
-_SPEC = importlib.util.spec_from_file_location("degenerate_lanes", _PATH)
-lanes = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(lanes)
 
 SE2, SO2 = jl.poses.SE2, jl.poses.SO2
 

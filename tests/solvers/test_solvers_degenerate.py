@@ -1,22 +1,13 @@
 """Every estimator of the room with degenerate numbers in every input: finite values and gradients, `ok` shows it."""
 
-import importlib.util
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
+import degenerate_estimates as estimates
 import jaxloc as jl
+from degenerate_estimates import Case
 from jaxloc.poses import SE2
-
-_SPEC = importlib.util.spec_from_file_location(
-    "degenerate_estimates", Path(__file__).with_name("degenerate_estimates.py")
-)
-estimates = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(estimates)
-Case = estimates.Case
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(-2.0, 2.0, (8, 3))
@@ -99,16 +90,6 @@ CASES = {
 # Some lanes of some estimators in the quick part of the suite.
 QUICK = {"clean", "all masked", "[1] masked", "source equal", "source[1]=nan", "clean again"}
 
-
-def test_every_estimator_is_here():
-    estimates.check_every_estimator_is_known("solvers", CASES)
-
-
-def test_some_lanes():
-    estimates.check(CASES["point_alignment.align_points"], QUICK)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_estimators(name):
-    estimates.check(CASES[name])
+test_every_estimator_is_here, test_some_lanes, test_estimators = estimates.make_tests(
+    "solvers", CASES, quick="point_alignment.align_points", lanes=QUICK
+)

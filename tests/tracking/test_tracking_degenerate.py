@@ -1,19 +1,12 @@
 """Every tracker with degenerate numbers in every input: states and gradients are finite, `ok` shows it."""
 
-import importlib.util
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import degenerate_lanes as lanes
 import jaxloc as jl
-
-_PATH = Path(__file__).parents[1] / "filters" / "degenerate_lanes.py"
-_SPEC = importlib.util.spec_from_file_location("degenerate_lanes", _PATH)
-lanes = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(lanes)
 
 T, F = jl.tracking, jl.filters
 

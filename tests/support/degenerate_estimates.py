@@ -5,29 +5,19 @@ Estimators are the public functions whose result has a flag ``ok``; each needs a
 
 import dataclasses
 import importlib
-import importlib.util
 import inspect
 import re
 import typing
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
+import degenerate_lanes as shared
 
-def load(path):
-    """A module of the tests by its path below ``tests``."""
-    path = Path(__file__).parents[1] / path
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-shared = load("filters/degenerate_lanes.py")
 LARGEST = shared.LARGEST
 NOT_FINITE = {"nan": np.nan, "inf": np.inf, "-inf": -np.inf}
 HUGE = {"largest": LARGEST, "1e30": 1e30}
@@ -265,3 +255,28 @@ def check(case, only=None):
     """Runs the lanes of an estimator in one program, and checks values, gradients and ``ok``."""
     problems = problems_of(case, only)
     assert not problems, "\n".join(["", *problems])
+
+
+def make_tests(room, cases, *, quick, lanes, others=()):
+    """The tests of a room: every estimator has a case, one estimator in some lanes, and (slow) all in all lanes.
+
+    Args:
+        room: its name.
+        cases: by estimator.
+        quick: the estimator that runs in the quick part of the suite.
+        lanes: of it.
+        others: estimators that run as part of others.
+    """
+
+    def test_every_estimator_is_here():
+        check_every_estimator_is_known(room, {*cases, *others})
+
+    def test_some_lanes():
+        check(cases[quick], lanes)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("name", cases)
+    def test_estimators(name):
+        check(cases[name])
+
+    return test_every_estimator_is_here, test_some_lanes, test_estimators
