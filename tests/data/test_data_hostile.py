@@ -3,6 +3,7 @@
 `JAXLOC_MUTATIONS=1000 pytest tests/data/test_data_hostile.py` tries more.
 """
 
+import importlib
 import inspect
 import os
 import pkgutil
